@@ -11,7 +11,6 @@ import gc
 import logging
 import math
 from collections.abc import Callable, Coroutine
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,32 +19,39 @@ import numpy as np
 from daemon.config.paths import state_folder
 from daemon.config.schema import Config
 from daemon.devices.conversion import SampleBridge, ScanBridge
+from daemon.devices.light_setup import Lights, load_lights
 from daemon.devices.photodiode import BlockWatch
 from daemon.devices.port_tap import tapped
-from daemon.environment import NoLidar, World
+from daemon.environment import Environment, NoLidar
 from daemon.health.assessment import Vitals
+from daemon.health.present_faults import PresentFaults
 from daemon.health.report import Reporter
 from daemon.health.supervisor import Supervisor
-from daemon.health.thread_watch import COMPUTING_S, DISK_S, Answers
-from daemon.maps.autosave import About, Keeper
+from daemon.health.thread_watch import COMPUTING_S, DISK_S, ThreadWatch
+from daemon.maps.autosave import About, MapAutosaver
+from daemon.maps.initial_state import CannotBegin, NoMap
 from daemon.maps.last_pose import LastPose
 from daemon.maps.schema import digest_of
-from daemon.maps.store import NoMap, Start, judge_for
-from daemon.maps.switching import Maps, MapSwitch, Switch, take_over
-from daemon.publish.network import Feeds, Network
-from daemon.publish.stream_ticker import StreamBeat
-from daemon.runtime.cycle import Cycle, Parts, Step
+from daemon.maps.store import judge_for
+from daemon.maps.switching import Maps, MapSwitch, Switch
+from daemon.publish.feeds import Feeds
+from daemon.publish.network import Network
+from daemon.publish.stream.ticker import StreamBeat
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import Parts, PendingSwitch
+from daemon.runtime.estimator_runner import EstimatorRunner
 from daemon.runtime.heartbeat import Heartbeat
-from daemon.runtime.light_setup import CannotBegin, Lights, load_lights, new_state
+from daemon.runtime.inbox import Inbox
 from daemon.runtime.scheduler import Pacemaker
+from daemon.runtime.snapshot_builder import SnapshotBuilder
+from daemon.runtime.stage_times import StageTimer
 from daemon.runtime.vitals import process_age_s, resident_mb, statistics, vitals
 from daemon.runtime.warmup import Warmth
-from daemon.runtime.worker import ThreadWorker
+from daemon.runtime.worker import ThreadWorker, Worker
 from daemon.snapshot import Snapshot, State, Thread
 from daemon.system.realtime import claim, line_up
 from daemon.system.sd_notify import notify
-from estimator.measurements import Command, Limits, Order, Record, no_lap
-from estimator.result import StepResult
+from estimator import Command, Order
 from hal.adc import BusStuck, RawSamples
 from hal.lidar import Lidar, RawScan
 from hal.net.inputs import OnImu, OnOdometry
@@ -54,9 +60,8 @@ from hal.replay.recording import Kind
 
 if TYPE_CHECKING:
     from daemon.recording.recorder import Recorder
-    from estimator.state import State as Estimate
 
-__all__ = ["Daemon", "World"]
+__all__ = ["Daemon", "Environment"]
 
 log = logging.getLogger(__name__)
 
@@ -78,57 +83,73 @@ class Daemon:
         SurveyError: the survey of the lamps cannot be used.
     """
 
-    def __init__(self, settings: Config, world: World, recorder: Recorder | None = None) -> None:
-        self.supervisor = Supervisor()
-        self._world = world
-        self._begun = world.clock.now()
-        self._recorder = recorder
-        lights = world.lights or load_lights(settings)
-        opener = world.opener if recorder is None else recorder.tap(world.opener)
-        opener = opener if world.stream is None else tapped(opener, self._on_raw, world.clock)
+    def __init__(self, settings: Config, environment: Environment, recorder: Recorder | None = None) -> None:
+        self._environment, self._recorder = environment, recorder
+        clock = environment.clock
+        self._begun = clock.now()
+        lights = environment.lights or load_lights(settings)
+
+        opener = environment.opener if recorder is None else recorder.tap(environment.opener)
+        opener = opener if environment.stream is None else tapped(opener, self._on_raw, clock)
         fitted = settings.lidar.fitted
-        self.lidar: Lidar = world.make_lidar(settings.lidar, world.clock, opener) if fitted else NoLidar()
-        self.adc = None if lights is None else world.make_adc(settings.photodiode, world.clock, world.buses)
-        self._estimator = _Estimator(lights, world.start, settings.map.localise)
+        self.lidar: Lidar = environment.make_lidar(settings.lidar, clock, opener) if fitted else NoLidar()
+        self.adc = None if lights is None else environment.make_adc(settings.photodiode, clock, environment.buses)
+        adc = None if self.adc is None else self.adc.status
+
+        timer = StageTimer(environment.stopwatch)
+        self._estimator = EstimatorRunner(lights, environment.start, settings.map.localise, timer.lap)
+        inbox, snapshots, switch = Inbox(), SnapshotBuilder(self._first_map_id()), PendingSwitch()
+        worker = environment.make_worker()
+
+        self.autosaver = self._autosaver(settings, lights, snapshots)
+        self.last_pose = None if environment.store is None else LastPose(environment.store.folder, state_folder())
+        self.maps = self._map_switch(lights, switch)
+
+        self.supervisor, self.faults = Supervisor(), PresentFaults()
+        self.threads = self._watched_threads(worker)
+        reporter = Reporter(clock, self.supervisor, self.threads, self.faults, (self.lidar.status, adc))
+        self.network = Network(settings, clock, self._feeds(inbox, snapshots), environment.stream)
+
+        kept = [] if self.last_pose is None else [self.last_pose.on_snapshot]
         self.cycle = Cycle(
             Parts(
-                clock=world.clock,
+                clock=clock,
                 step=self._estimator,
                 scans=ScanBridge(settings.lidar),
-                budget=world.make_budget(),
-                worker=world.make_worker(),
+                budget=environment.make_budget(),
+                worker=worker,
                 status=self.lidar.status,
                 lidar=fitted,
                 odometry=settings.odometry.port > 0,
                 samples=None if lights is None else SampleBridge(lights.profile),
-                blocks=None if lights is None or self.adc is None else BlockWatch(self.adc.status, lights.profile),
+                blocks=None if lights is None or adc is None else BlockWatch(adc, lights.profile),
                 budget_us=1e3 * settings.cycle.budget_ms,
-                stopwatch=world.stopwatch,
+                timer=timer,
+                inbox=inbox,
+                snapshots=snapshots,
+                switch=switch,
+                sinks=[*self.network.sinks, *kept, *environment.sinks, _FirstPose()],
                 tap=None if recorder is None else recorder.on_cycle,
-                map_id=world.draw_map_id() if world.start is None else world.start.stored.meta.map_id,
+                fault=self.faults.gravest,
+                condition=reporter,
                 alert_m=settings.integrity.alert_m,
                 t_begun=0.0 if recorder is None else recorder.t_begun,  # a replay begins at the same instant
             )
         )
-        self._estimator.lap = self.cycle.laps.lap
-        self.keeper = self._keeper(settings, lights)
-        self.last_pose = None if world.store is None else LastPose(world.store.folder, state_folder())
-        self.maps = self._map_switch(lights)
-        self.pacemaker = Pacemaker(self.cycle)
-        self._on_scan = self.pacemaker.on_scan if recorder is None else recorder.on_scan(self.pacemaker.on_scan)
-        on_samples = self.pacemaker.on_samples
-        self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
-        self.network = Network(settings, world.clock, self._feeds(), world.stream)
-        kept = [] if self.last_pose is None else [self.last_pose.take]
-        self.cycle.parts.sinks += [*self.network.sinks, *kept, *world.sinks, _FirstPose()]
-        self.answers = self._answers()
-        self.heartbeat = Heartbeat(self._vitals, lambda: statistics(self.cycle), lambda: self.answers.alive)
-        self.cycle.parts.fault = self.heartbeat.fault
-        drivers = self.lidar.status, None if self.adc is None else self.adc.status
-        reporter = Reporter(world.clock, self.supervisor, self.answers, lambda: self.heartbeat.faults, drivers)
-        self.cycle.parts.condition = reporter
         if recorder is not None:
-            recorder.box.attach(self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults)
+            recorder.box.attach(self.cycle, lambda: self._estimator.state, lambda: self.faults.faults)
+        self.heartbeat = Heartbeat(
+            self._vitals, lambda: statistics(self.cycle.facts()), lambda: self.threads.alive, self.faults
+        )
+        self.pacemaker = Pacemaker(self.cycle)
+        on_scan, on_samples = self.pacemaker.on_scan, self.pacemaker.on_samples
+        self._on_scan = on_scan if recorder is None else recorder.on_scan(on_scan)
+        self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
+
+    def _first_map_id(self) -> int:
+        """Of the stored map that the run begins with, else a new one."""
+        start = self._environment.start
+        return self._environment.draw_map_id() if start is None else start.stored.meta.map_id
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set.
@@ -153,13 +174,13 @@ class Daemon:
             log.info("stopping")
             self._keep_sample_clock()
             await _stop(tasks.get("cycle"))
-            saving = asyncio.create_task(self.keeper.finish(stop.is_set()), name="map at the stop")
+            saving = asyncio.create_task(self.autosaver.finish(stop.is_set()), name="map at the stop")
             for name in ("lidar", *tasks):  # the lidar before what only listens: its laser is to go off
                 await _stop(tasks.get(name))
             for task in (stopped, warming):
                 await _stop(task)
             self.cycle.parts.worker.close()
-            for kept in (self.last_pose, self._world.sample_clock):
+            for kept in (self.last_pose, self._environment.sample_clock):
                 if kept is not None:
                     kept.close()
             await saving
@@ -167,16 +188,16 @@ class Daemon:
                 self._recorder.close(ended=stop.is_set())
 
     async def _warm_up(self) -> None:
-        warmth = await self._world.warm_up()
+        warmth = await self._environment.warm_up()
         if isinstance(warmth, Warmth) and warmth.code_us > 0.0:
             self.cycle.parts.budget.learn_code(warmth.code_us)
-        if self._world.store is not None:
-            self._world.store.trial.begin()
-        if self._world.start is not None:
-            self._begin(self._world.start.stored.meta.map_id)
+        if self._environment.store is not None:
+            self._environment.store.trial.begin()
+        if self._environment.start is not None:
+            self._begin(self._environment.start.stored.meta.map_id)
             gc.freeze()  # the map stays
             self._remember()
-        self.keeper.loaded()
+        self.autosaver.loaded()
 
     def _begin(self, map_id: int) -> None:
         """Load the map that is stored; without it, and under another identity, where nothing can be begun with it.
@@ -186,7 +207,7 @@ class Daemon:
         Raises:
             NoMap: there is none that can be used, and `map.localise` asks for one.
         """
-        store = self._world.store
+        store = self._environment.store
         try:
             self._estimator.load()
         except CannotBegin as error:
@@ -196,8 +217,8 @@ class Daemon:
                 raise NoMap(f"map {map_id:08x} cannot be used, and `map.localise` is true; start again") from error
             self._estimator.start = None
             self._estimator.load()
-            self.cycle.map_id = self._world.draw_map_id()
-            self.keeper.without_start()
+            self.cycle.map_id = self._environment.draw_map_id()
+            self.autosaver.without_start()
             self.maps.ask(map_id, lambda why: log.warning("a new map is begun: %s", why) if why else None, patient=True)
 
     def _remember(self) -> None:
@@ -205,62 +226,68 @@ class Daemon:
         pose = None if self.last_pose is None else self.last_pose.of_map(self.cycle.map_id)
         if pose is not None:
             log.info("the robot was last at x %.2f m, y %.2f m, heading %.1f deg", *pose[:2], math.degrees(pose[2]))
-            self.cycle.inbox.put_command(Command(self._world.clock.now(), Order.REMEMBERED, np.array(pose)))
+            self.cycle.inbox.put_command(Command(self._environment.clock.now(), Order.REMEMBERED, np.array(pose)))
 
-    def _keeper(self, settings: Config, lights: Lights | None) -> Keeper:
+    def _autosaver(self, settings: Config, lights: Lights | None, snapshots: SnapshotBuilder) -> MapAutosaver:
         survey = "" if lights is None else digest_of(lights.survey)
         about = About(settings.name, survey, settings.map.localise)
-        world, cycle = self._world, self.cycle
-        return Keeper(world.store, world.start, lambda: self._estimator.state, lambda: cycle.map_id, about, world.clock)
+        environment, estimator = self._environment, self._estimator
+        return MapAutosaver(
+            environment.store,
+            environment.start,
+            lambda: estimator.state,
+            lambda: snapshots.map_id,
+            about,
+            environment.clock,
+        )
 
-    def _map_switch(self, lights: Lights | None) -> MapSwitch:
+    def _map_switch(self, lights: Lights | None, pending: PendingSwitch) -> MapSwitch:
         keep = None if self._recorder is None else self._recorder.keep_switch
-        maps = Maps(self._world.store, judge_for(lights), self._estimator.made, keep)
-        return MapSwitch(maps, self.keeper, self._put_switch)
+        maps = Maps(self._environment.store, judge_for(lights), self._estimator.made, keep)
+        estimator, autosaver = self._estimator, self.autosaver
 
-    def _put_switch(self, switch: Switch | None, taken: Callable[[], None]) -> None:
-        """The cycle takes it over (None: does not after all); what is kept of maps knows it in the same instant."""
-        if switch is None:
-            self.cycle.switch(None)
-            return
+        def put(switch: Switch | None, taken: Callable[[], None]) -> None:
+            """The cycle takes it over (None: does not after all); the autosaver has it at the same instant."""
 
-        def take_over() -> tuple[int, str]:
-            self._estimator.take_over(switch)
-            self.keeper.switched(switch.map_id, switch.start)
-            taken()
-            return switch.map_id, switch.sha256
+            def take_over(switch: Switch) -> tuple[int, str]:
+                estimator.take_over(switch)
+                autosaver.switched(switch.map_id, switch.start)
+                taken()
+                return switch.map_id, switch.sha256
 
-        self.cycle.switch(take_over)
+            pending.take_over = None if switch is None else partial(take_over, switch)
+
+        return MapSwitch(maps, autosaver, put)
 
     def _parts(self) -> dict[str, Coroutine[None, None, None]]:
         """What runs beside the cycle, in order of start."""
         parts = {**self.network.parts, "lidar": lambda: self.lidar.run(self._take_scan)}
-        if self._world.store is not None:
-            parts["map"] = self.keeper.run
+        if self._environment.store is not None:
+            parts["map"] = self.autosaver.run
         if (adc := self.adc) is not None:
             parts["photodiode"] = lambda: adc.run(self._take_samples)
         if self.network.stream is not None:
             beat = StreamBeat(
-                self.network.stream, self.cycle, lambda: self._estimator.state, lambda: self.heartbeat.faults
+                self.network.stream, self.cycle.facts, lambda: self._estimator.state, lambda: self.faults.faults
             )
             parts["stream beat"] = beat.run
         supervised = {name: self.supervisor.keep(name, run) for name, run in parts.items()}
         return {"heartbeat": self.heartbeat.run(), **supervised}
 
-    def _answers(self) -> Answers:
+    def _watched_threads(self, worker: Worker) -> ThreadWatch:
         """The threads that are watched."""
-        answers, keeper, worker = Answers(), self.keeper, self.cycle.parts.worker
-        answers.watch(Thread.MAP, lambda: keeper.busy_since, DISK_S)
+        threads, autosaver = ThreadWatch(), self.autosaver
+        threads.watch(Thread.MAP, lambda: autosaver.busy_since, DISK_S)
         if isinstance(worker, ThreadWorker):
-            answers.watch(Thread.SOLVER, lambda: worker.since[0], COMPUTING_S)
-            answers.watch(Thread.SEARCH, lambda: worker.since[1], COMPUTING_S)
+            threads.watch(Thread.SOLVER, lambda: worker.since[0], COMPUTING_S)
+            threads.watch(Thread.SEARCH, lambda: worker.since[1], COMPUTING_S)
         if (last := self.last_pose) is not None:
-            answers.watch(Thread.POSE, lambda: last.busy_since, DISK_S)
+            threads.watch(Thread.POSE, lambda: last.busy_since, DISK_S)
         if (recorder := self._recorder) is not None:
-            answers.watch(Thread.RECORDING, lambda: recorder.disk.busy_since, DISK_S)
+            threads.watch(Thread.RECORDING, lambda: recorder.disk.busy_since, DISK_S)
         if (adc := self.adc) is not None:
-            answers.watch(Thread.I2C, lambda: 0.0 if isinstance(adc.status.error, BusStuck) else None, HANG_S)
-        return answers
+            threads.watch(Thread.I2C, lambda: 0.0 if isinstance(adc.status.error, BusStuck) else None, HANG_S)
+        return threads
 
     def _on_raw(self, kind: Kind, t_mono: float, data: bytes) -> None:
         if self.network.stream is not None:
@@ -276,24 +303,24 @@ class Daemon:
         if self.network.stream is not None:
             self.network.stream.on_scan(scan)
 
-    def _feeds(self) -> Feeds:
-        cycle, recorder = self.cycle, self._recorder
-        on_odometry: OnOdometry = cycle.inbox.put_odometry
-        on_imu: OnImu = cycle.inbox.put_imu
+    def _feeds(self, inbox: Inbox, snapshots: SnapshotBuilder) -> Feeds:
+        recorder = self._recorder
+        on_odometry: OnOdometry = inbox.put_odometry
+        on_imu: OnImu = inbox.put_imu
         if recorder is not None:
             on_odometry, on_imu = recorder.on_odometry(on_odometry), recorder.on_imu(on_imu)
         return Feeds(
             on_odometry,
             on_imu,
-            on_command=cycle.inbox.put_command,
-            on_save=self.keeper.ask,
+            on_command=inbox.put_command,
+            on_save=self.autosaver.ask,
             on_dump=None if recorder is None else recorder.box.dump,
             on_switch=self.maps.ask,
-            on_loop_seen=cycle.loops_seen,
+            on_loop_seen=snapshots.on_loops_seen,
         )
 
     def _keep_sample_clock(self) -> None:
-        result, store = self.cycle.result, self._world.sample_clock
+        result, store = self.cycle.result, self._environment.sample_clock
         if store is not None and result is not None and result.lights is not None:
             store.learn(result.lights.clock_ppm)
 
@@ -302,59 +329,19 @@ class Daemon:
         line_up()
         if self.cycle.cycles == 0:
             self.cycle.announce()
-            if self._world.clock.now() - self._begun < STARTING_S:
+            if self._environment.clock.now() - self._begun < STARTING_S:
                 notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=loading the estimator")
         failed = self.supervisor.failed | self.network.failing
         failed |= set() if self._recorder is None else self._recorder.failing
-        if self.keeper.error:
+        if self.autosaver.error:
             failed.add("map")
         if self.last_pose is not None and self.last_pose.error:
             failed.add("last pose")
-        if self.keeper.refused:
+        if self.autosaver.refused:
             failed.add("stored map")
-        if self.answers.look() - {Thread.I2C}:  # a bus has faults of its own
+        if self.threads.look() - {Thread.I2C}:  # a bus has faults of its own
             failed.add("thread")
-        return vitals(self.cycle, failed, max(lateness, self.pacemaker.latest()))
-
-
-class _Estimator:
-    """The estimator with its state; loaded with the first step at the latest, which the warm-up has made quick.
-
-    Attributes:
-        state: None until then. start: the map that it begins with. localise: maps are only used, never changed.
-        lap: told the name of each part of a step that has ended.
-    """
-
-    def __init__(self, lights: Lights | None, start: Start | None, localise: bool = False) -> None:
-        self.state: Estimate | None = None
-        self.localise = localise
-        self._lights = lights
-        self.start = start
-        self._step: Step | None = None
-        self.lap: Callable[[str], object] = no_lap
-
-    def made(self, start: Start) -> Estimate:
-        """A state as at a start in a stored map; may be called in another thread."""
-        from estimator import pipeline
-
-        return new_state(self._lights, pipeline.Settings(), replace(start, localise=self.localise))
-
-    def take_over(self, switch: Switch) -> None:
-        """Go on in another map."""
-        assert self.state is not None
-        take_over(self.state, switch.donor)
-
-    def load(self) -> Step:
-        """Load the estimator, and the map into it."""
-        from estimator import pipeline
-
-        self.state = new_state(self._lights, pipeline.Settings(localise=self.localise), self.start)
-        self._step = partial(pipeline.step, self.state, lap=self.lap)
-        return self._step
-
-    def __call__(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
-        step = self._step or self.load()
-        return step(records, limits)
+        return vitals(self.cycle.facts(), failed, max(lateness, self.pacemaker.latest()))
 
 
 class _FirstPose:

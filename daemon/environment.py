@@ -12,18 +12,19 @@ from typing import Protocol
 
 from daemon.config.endpoints import parse_lidar
 from daemon.config.schema import LidarConfig
+from daemon.devices.light_setup import Lights
 from daemon.devices.photodiode import AdcMaker, make_adc
 from daemon.devices.sample_clock import SampleClock
 from daemon.maps.store import Start, Store
 from daemon.runtime.budget import Budget, MeasuredBudget
-from daemon.runtime.cycle import Sink
-from daemon.runtime.light_setup import Lights
+from daemon.runtime.cycle_parts import Sink
 from daemon.runtime.warmup import warm_up
 from daemon.runtime.worker import ThreadWorker, Worker
 from hal.bus.i2c import BusOpener
+from hal.bus.opening import open_bus
 from hal.clock import Clock
 from hal.lidar import Lidar, LidarGeometry, LidarStatus, RawScan
-from hal.port.opening import open_bus, open_port
+from hal.port.opening import open_port
 from hal.port.port import PortOpener
 
 
@@ -72,7 +73,7 @@ class NoLidar:
 
 
 @dataclass(slots=True)
-class World:
+class Environment:
     """What the daemon meets outside itself. A test replaces any of it; the defaults are the real thing.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""The one picture of the world that every publisher shows: built once per cycle, never changed afterwards."""
+"""The snapshot: everything that is published of one cycle, immutable."""
 
 from __future__ import annotations
 
@@ -83,11 +83,11 @@ Spread = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Pulse:
+class CycleTiming:
     """How the cycle itself is doing; None: not known.
 
     Attributes:
-        rung: what is left out for lack of time, or by a pause (`estimator.measurements.Rung`).
+        rung: what is left out for lack of time, or by a pause (`estimator.measurements.DegradationLevel`).
         thinned, without_map, carried: cycles on rung 1, 2, 3 since the start.
         stalls: how often no cycle began in time; stall_s, stall_in: how long the latest lasted, and where.
         cycle, late: computing time of a cycle, and how late it began. stages: of each of :class:`Stage`, in order.
@@ -149,6 +149,10 @@ class Condition:
 
 
 NO_CONDITION: Final = Condition()
+
+
+LISTED_LINKS: Final = 16
+"""Links that a snapshot lists, the strongest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,5 +274,5 @@ class Snapshot:
     loop_reason: int | None = None
     loop_residual: float | None = None
     loop_latched: bool = False
-    pulse: Pulse | None = None
+    pulse: CycleTiming | None = None
     condition: Condition | None = None

@@ -88,7 +88,9 @@ class Order(Enum):
     SET_POSE = "set_pose"
     RESET = "reset"
     RELOCALISE = "relocalise"
-    PAUSE = "pause"  # obeyed by the cycle: it asks for no more than :attr:`Rung.CARRIED`, and applies no answer
+    PAUSE = (
+        "pause"  # obeyed by the cycle: it asks for no more than :attr:`DegradationLevel.CARRIED`, and applies no answer
+    )
     RESUME = "resume"
     REMEMBERED = "remembered"  # by nobody: the pose that was stored when the run before ended; a witness, no order
 
@@ -137,7 +139,7 @@ def no_lap(part: str) -> None:
     """A :data:`Lap` that nobody looks at."""
 
 
-class Rung(IntEnum):
+class DegradationLevel(IntEnum):
     """How far a step does without: each leaves out what the ones before it leave out, and more."""
 
     FULL = 0  # everything
@@ -155,14 +157,14 @@ class Limits:
         points: cap on query points per match (the scan is thinned evenly above it).
         update_map: whether keyframe and map work may run in this cycle.
         codes: effort for lamps not seen yet, in light codes that could be searched (6 us each with profile A).
-        rung: what the step leaves out, :class:`Rung`.
+        level: what the step leaves out, :class:`DegradationLevel`.
     """
 
     icp_iterations: int
     points: int
     update_map: bool
     codes: int = 150
-    rung: int = 0
+    level: int = 0
 
 
 UNLIMITED: Final = Limits(icp_iterations=50, points=100_000, update_map=True)

@@ -30,13 +30,13 @@ from estimator.measurements import (
     UNLIMITED,
     Answer,
     Command,
+    DegradationLevel,
     Imu,
     Lap,
     LightEpoch,
     Limits,
     Odometry,
     Record,
-    Rung,
     SampleBlock,
     Scan,
     no_lap,
@@ -114,7 +114,7 @@ def see(state: State, scan: Scan, limits: Limits, refusal: Reason | None, lap: L
     if suspected:
         kidnap_detection.look(state, scan, points, match)
     lap("match")
-    if not (limits.update_map and limits.rung < Rung.NO_MAP and extends_map(state, points, match)):
+    if not (limits.update_map and limits.level < DegradationLevel.NO_MAP and extends_map(state, points, match)):
         return match, -1
     keyframe = extend_map(state, scan, points, limits, match)
     lap("map")
@@ -163,7 +163,7 @@ def extend_map(state: State, scan: Scan, points: ScanPoints, limits: Limits, mat
 
 def passed_over(state: State, scan: Scan, limits: Limits) -> Reason | None:
     """Why a scan is not matched in this step, if it is not: lights and odometry carry the pose, or it is too old."""
-    if limits.rung >= Rung.CARRIED:
+    if limits.level >= DegradationLevel.CARRIED:
         return Reason.PASSED_OVER
     return Reason.LATE if out_of_sequence.too_old(state.motion, scan) else None
 
@@ -318,7 +318,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         aside=map_.parts.aside is not None,
         let_go=state.relocalisation.maps_dropped,
         lag=state.time_offset.told,
-        jobs=state.jobs.take() if limits.rung < Rung.NO_MAP else (),
+        jobs=state.jobs.take() if limits.level < DegradationLevel.NO_MAP else (),
         anew=state.matching.restarts,
         protection=protection_level.bound(pose, motion, state.light, state.matching, P),
     )

@@ -1,4 +1,4 @@
-"""What a photodiode's converter yields, in device units: the contract between any ADC driver and the daemon."""
+"""The contract between the photodiode's ADC driver and the daemon: sample blocks in device units, status, errors."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from hal.lidar import Link
 
 
 class Blemish(Flag):
-    """What is known to be wrong with a block of samples; the block is delivered all the same."""
+    """Known defects of a sample block. The block is delivered nevertheless."""
 
     NONE = 0
-    STRETCHED = auto()  # took longer than its bits: returned late, or samples inside are not evenly spaced
-    CLIPPED = auto()  # words at either rail, or as close to one as an amplifier gets
+    STRETCHED = auto()  # longer than its bits take: returned late, or its samples are not evenly spaced
+    CLIPPED = auto()  # words at either rail, or as close to it as the amplifier gets
     STUCK = auto()  # the same word over and over
-    MISALIGNED = auto()  # upper bits set: shifted or lost bits, or a bus that floats
-    SHORT = auto()  # fewer words than asked for
+    MISALIGNED = auto()  # upper bits set: shifted or lost bits, or a floating bus
+    SHORT = auto()  # fewer words than requested
     GAP = auto()  # blocks are missing before this one: dropped, or the bus was not read for longer than a block
 
 
@@ -33,10 +33,11 @@ class RawSamples:
     Attributes:
         seq: counts blocks of this driver from 0.
         t0, t1: ``t_mono`` immediately before and after the transaction.
-        t_first: earliest ``t_mono`` of the first conversion, anchored at ``t0``. slack_s: it was no later than
-            ``t_first + slack_s``: by how much longer than its bits the transaction took. Nearly all of that is at the
-            end, where ``t_first`` does not suffer from it (a late return: this process or its interpreter was busy);
-            the rest is fixed overhead, another client of the bus before the block, or a stall inside it.
+        t_first: earliest ``t_mono`` of the first conversion, anchored at ``t0``.
+        slack_s: upper bound of the delay of the first conversion after ``t_first``: the transaction's excess over the
+            duration of its bits. Most of the excess is a late return at the end (the process or its interpreter was
+            busy) and does not move ``t_first``. The rest is fixed overhead, another client of the bus before the
+            block, or a stall inside it.
         rate_hz: conversions per second as measured from transaction lengths; the decoder refines it.
         words: uint16, right-aligned converter codes, 0 .. 2**bits - 1.
     """
@@ -53,36 +54,36 @@ class RawSamples:
 
 
 class ChipMissing(DeviceMissing):
-    """The bus is there, and nothing acknowledges the converter's address."""
+    """The bus is present, but nothing acknowledges the converter's address."""
 
 
 class WrongChip(DeviceRefused):
-    """Something answers that is not such a converter."""
+    """Another kind of chip answers at the converter's address."""
 
 
 class BusStuck(DeviceFault):
-    """Transactions time out, or do not return at all."""
+    """Transactions time out, or do not return."""
 
 
 class NoSignal(DeviceFault):
-    """The words say nothing: no light, so much that the amplifier is saturated, or a dead converter."""
+    """The words carry no signal: no light, a saturated amplifier, or a dead converter."""
 
 
 class Dark(NoSignal):
-    """No light, as the DC channel says."""
+    """No light, according to the DC channel."""
 
 
 class Dazzled(NoSignal):
-    """Too much light, as the DC channel says."""
+    """A saturated amplifier, according to the DC channel."""
 
 
 class Clipping(DeviceFault):
-    """Much of the signal lies beyond the converter's range."""
+    """A large part of the signal lies beyond the converter's range."""
 
 
 @dataclass(slots=True)
 class AdcStatus:
-    """Live state and counters of a converter, read by the daemon for health."""
+    """Live state and counters of a converter; the daemon reads them for health."""
 
     link: Link = Link.CLOSED
     error: HalError | None = None
@@ -94,7 +95,7 @@ class AdcStatus:
 
 
 class Adc(Protocol):
-    """A converter's driver. It supervises itself: `run` never raises for anything a bus or a chip can do."""
+    """A converter's driver. It supervises itself: `run` raises for no failure of a bus or a chip."""
 
     @property
     def status(self) -> AdcStatus:
@@ -102,5 +103,5 @@ class Adc(Protocol):
         ...
 
     async def run(self, on_samples: Callable[[RawSamples], None]) -> None:
-        """Read block after block; deliver from the loop thread; recover by itself until cancelled or exhausted."""
+        """Read blocks, deliver them from the loop thread, and recover from failures, until cancelled or exhausted."""
         ...

@@ -1,7 +1,7 @@
-"""Calls that block, beside the event loop.
+"""Runs a blocking call in a thread that does not delay the end of the process.
 
-The loop's own threads are waited for at the end of `asyncio.run`: a name server that does not answer, or a wedged
-adapter that is being opened, would hold up a stop for as long as they please. These threads die with the process.
+`asyncio.run` waits for the loop's own executor threads at its end. A name server that does not answer, or the open of a
+wedged adapter, would then hold up a stop without limit. The threads of this module are daemon threads.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def beside(work: Callable[[], T], name: str) -> asyncio.Future[T]:
-    """Run in a thread of its own, called ``lumiloop-`` and ``name``, for which nobody waits at a stop.
+def run_in_thread(work: Callable[[], T], name: str) -> asyncio.Future[T]:
+    """Call ``work`` in a new daemon thread named ``lumiloop-`` and ``name``; the future carries its result or error.
 
     Raises:
-        RuntimeError: the system has no thread left.
+        RuntimeError: the system cannot start another thread.
     """
     loop = asyncio.get_running_loop()
     ended: asyncio.Future[T] = loop.create_future()
@@ -34,7 +34,7 @@ def beside(work: Callable[[], T], name: str) -> asyncio.Future[T]:
             settle = partial(ended.set_result, work())
         except Exception as error:  # noqa: BLE001  raised again where it is awaited
             settle = partial(ended.set_exception, error)
-        with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
+        with contextlib.suppress(RuntimeError):  # the loop has closed: the result is not needed
             loop.call_soon_threadsafe(end, settle)
 
     threading.Thread(target=run, name=f"lumiloop-{name}", daemon=True).start()

@@ -1,4 +1,4 @@
-"""One injected clock, real or virtual.
+"""The injected clock, real or virtual, and the event loop that runs in virtual time.
 
 ``t_mono`` everywhere in the project means seconds of CLOCK_MONOTONIC (or of the virtual clock); UTC exists only at the
 edge. Virtual time is a property of the event loop: under :class:`VirtualLoop`, ``asyncio.sleep``, ``call_at`` and
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 class Clock(Protocol):
-    """What the daemon and the drivers may know about time."""
+    """The only source of time for the daemon and the drivers."""
 
     def now(self) -> float:
         """Seconds of the monotonic clock (``t_mono``)."""
@@ -42,7 +42,7 @@ class SystemClock:
 
 
 class LoopClock:
-    """Time as a :class:`VirtualLoop` keeps it; ``utc`` starts at a settable epoch so that runs are repeatable."""
+    """The time of a :class:`VirtualLoop`; ``utc`` starts at a settable epoch so that runs are repeatable."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, utc_at_zero: float = 0.0) -> None:
         self._loop = loop

@@ -1,4 +1,4 @@
-"""Yaw gyro as an input of its own."""
+"""The contract of a yaw gyro: readings in rad/s."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class RawImu:
 
 
 class ImuSource(Protocol):
-    """Anything that yields gyro readings: a UDP listener, a log."""
+    """A source of gyro readings: a UDP listener, a log."""
 
     async def run(self, on_imu: Callable[[RawImu], None]) -> None:
         """Deliver readings from the loop thread until cancelled or exhausted."""

@@ -1,4 +1,4 @@
-"""What a 2D lidar yields, in device units: the contract between any lidar driver and the daemon.
+"""The contract between a 2D lidar's driver and the daemon: scans in device units, geometry, status.
 
 Units are the device's own (steps, range units, device ticks). Only ``daemon/devices/conversion.py`` turns them into SI
 and frames.
@@ -22,7 +22,7 @@ VALID: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class LidarGeometry:
-    """Facts a device states about itself (SCIP ``VV``/``PP``, a log's header), never hard-coded by model.
+    """Geometry that the device itself reports (SCIP ``VV``/``PP``, a log's header), never hard-coded by model.
 
     Attributes:
         ares: steps per full turn; not necessarily whole for a log.
@@ -31,7 +31,7 @@ class LidarGeometry:
         dmin, dmax: legal distances in range units; below ``dmin`` a value is an error code, above ``dmax`` no return.
         range_unit_m: metres per range unit (SCIP: 0.001).
         period_s: nominal time of a revolution in seconds (SCIP ``60 / SCAN``).
-        beam_dt_s: time between adjacent steps in seconds; 0 where a log does not say.
+        beam_dt_s: time between adjacent steps in seconds; 0 where a log does not give it.
     """
 
     model: str
@@ -84,21 +84,21 @@ class RawScan:
 
 
 class Link(Enum):
-    """Where a device stands, as far as the daemon's state machine must know."""
+    """Connection state of a device, for the daemon's state machine."""
 
     CLOSED = "closed"
     OPENING = "opening"
     STREAMING = "streaming"
-    WAITING = "waiting"  # backing off before the next attempt; `LidarStatus.error` says why
+    WAITING = "waiting"  # backing off before the next attempt; the status carries the error
 
 
 @dataclass(slots=True)
 class LidarStatus:
-    """Live state and counters of a driver, read by the daemon for health and by ``lumiloop status``.
+    """Live state and counters of a driver, for the daemon's health and ``lumiloop status``.
 
     Attributes:
         error: the latest problem, kept until a valid scan has arrived.
-        scans: valid scans delivered. missed: revolutions the stamps show to be missing.
+        scans: valid scans delivered. missed: revolutions missing according to the stamps.
         invalid: frames dropped (checksum, step count, stamp). resyncs: times the stream had to be found again.
         reconnects: times the device was reopened. clock_resets: times the device clock restarted.
         dialect: protocol variant in use, for people (``SCIP 2.0 MD``).
@@ -117,7 +117,7 @@ class LidarStatus:
 
 
 class Lidar(Protocol):
-    """A lidar driver. It supervises itself: `run` never raises for anything a device can do."""
+    """A lidar driver. It supervises itself: `run` raises for no failure of a device."""
 
     @property
     def geometry(self) -> LidarGeometry | None:

@@ -1,4 +1,4 @@
-"""Wheel odometry as an input of its own: cumulative pose of the base in a frame that drifts but does not jump."""
+"""The contract of wheel odometry: the cumulative pose of the base in a frame that drifts but does not jump."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ class RawOdometry:
 
     Attributes:
         t_rx: ``t_mono`` of arrival (kernel receive stamp where there is one).
-        t_mono: ``t_mono`` at which the pose held; a sender without a shared clock: ``t_rx``, less what it was held up.
+        t_mono: ``t_mono`` at which the pose was true; for a sender without a shared clock: ``t_rx`` less the network's
+            hold-up.
         x, y: metres. yaw: rad, counter-clockwise, not necessarily wrapped.
-        missed: readings lost on their way since the one before; not recorded.
+        missed: readings lost in transit since the previous one; not recorded.
     """
 
     t_rx: float
@@ -27,7 +28,7 @@ class RawOdometry:
 
 
 class OdometrySource(Protocol):
-    """Anything that yields odometry: a UDP listener, a Modbus write, a log."""
+    """A source of odometry: a UDP listener, a Modbus write, a log."""
 
     async def run(self, on_odometry: Callable[[RawOdometry], None]) -> None:
         """Deliver readings from the loop thread until cancelled or exhausted."""

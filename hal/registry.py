@@ -1,4 +1,4 @@
-"""Lidar drivers by name, imported only when used, extended by installed packages.
+"""Registry of lidar drivers by name: imported when used, extended by entry points of installed packages.
 
 A device string is ``auto``, a path, ``tcp://host:port``, or ``name:rest``, where ``name`` is a registered driver and
 ``rest`` is its own to understand. Strings without a registered name belong to the HOKUYO driver.
@@ -24,22 +24,22 @@ _BUILT_IN: Final = {"hokuyo": "hal.hokuyo.driver:HokuyoDriver"}
 
 
 class LidarFactory(Protocol):
-    """What makes a driver; the arguments are those of :class:`hal.hokuyo.driver.HokuyoDriver`."""
+    """A constructor of a driver; arguments as of :class:`hal.hokuyo.driver.HokuyoDriver`."""
 
     def __call__(
         self, device: str, *, clock: Clock, opener: PortOpener, serial: str, baud: int, intensity: bool
     ) -> Lidar:
-        """Make a driver; nothing is opened yet. Raises `ValueError` for options it cannot do."""
+        """Make a driver; nothing is opened yet. Raises `ValueError` for options the driver does not support."""
         ...
 
 
 def names() -> list[str]:
-    """Registered drivers, built in and installed."""
+    """Names of the registered drivers, built in and installed."""
     return sorted({*_BUILT_IN, *(point.name for point in entry_points(group=GROUP))})
 
 
 def split(device: str) -> tuple[str, str]:
-    """Driver name and what is left of a device string: ``("hokuyo", "/dev/ttyACM0")``."""
+    """Split a device string into the driver's name and the rest: ``("hokuyo", "/dev/ttyACM0")``."""
     name, colon, rest = device.partition(":")
     if colon and not rest.startswith("//") and name in names():
         return name, rest
@@ -50,7 +50,7 @@ def lidar_factory(name: str) -> LidarFactory:
     """The driver called ``name``.
 
     Raises:
-        DeviceRefused: there is none, or its package does not import.
+        DeviceRefused: no such driver, or its package cannot be imported.
     """
     if name in _BUILT_IN:
         module, _, attribute = _BUILT_IN[name].partition(":")

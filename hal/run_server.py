@@ -1,4 +1,4 @@
-"""What the small programs share that serve a device until they are told to stop."""
+"""Start and stop of small server processes: output lines, SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from collections.abc import Coroutine
 from typing import Any
 
 
-def say(text: str) -> None:
-    """A line for whoever started this process."""
+def print_line(text: str) -> None:
+    """Write one line to standard output and flush it."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 
-def stopping() -> asyncio.Event:
-    """What is set by SIGINT or SIGTERM, from now on; in a running loop."""
+def stop_event() -> asyncio.Event:
+    """Return an event of the running loop that SIGINT and SIGTERM set from now on."""
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
     return stop
 
 
-async def until_told(seconds: float = 0.0) -> None:
-    """Wait for SIGINT or SIGTERM, or for a time."""
-    stop = stopping()
+async def until_stopped(seconds: float = 0.0) -> None:
+    """Wait for SIGINT or SIGTERM, at most ``seconds`` (0: no limit)."""
+    stop = stop_event()
     if seconds > 0:
         asyncio.get_running_loop().call_later(seconds, stop.set)
     await stop.wait()
 
 
-async def work_until_told(*works: Coroutine[Any, Any, None], seconds: float = 0.0) -> None:
-    """Work until :func:`until_told` returns; one that fails ends all, and what it raises is raised here."""
-    told = asyncio.create_task(until_told(seconds))
+async def run_until_stopped(*works: Coroutine[Any, Any, None], seconds: float = 0.0) -> None:
+    """Run ``works`` until :func:`until_stopped` returns; the first failure cancels all and is raised here."""
+    told = asyncio.create_task(until_stopped(seconds))
     tasks = [asyncio.create_task(work) for work in works]
     try:
         pending = {told, *tasks}

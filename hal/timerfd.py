@@ -1,6 +1,6 @@
-"""A timer of the kernel as a file (timerfd_create(2)), for loops whose own timers wake up a millisecond late.
+"""A kernel timer as a file descriptor (timerfd_create(2)): asyncio's own timers fire up to a millisecond late.
 
-epoll_wait(2) takes whole milliseconds, and asyncio rounds up; a timer that is a file is read when it is due.
+epoll_wait(2) takes whole milliseconds, and asyncio rounds its timeouts up. A timerfd becomes readable when it is due.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class _Times(ctypes.Structure):
 
 
 class Timer(Protocol):
-    """Calls back once at an instant of the loop's time; a later order replaces an earlier one."""
+    """Calls back once at an instant of the loop's time; a new instant replaces the one before."""
 
     def at(self, when: float) -> None:
         """Call back then; at once where that is past."""
@@ -42,7 +42,7 @@ class Timer(Protocol):
 
 
 class KernelTimer:
-    """A :class:`Timer` that is a file. Raises `OSError` where the system has none."""
+    """A :class:`Timer` on a timerfd. Raises `OSError` where the system has none."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], object]) -> None:
         self._libc = ctypes.CDLL(None, use_errno=True)
@@ -73,12 +73,12 @@ class KernelTimer:
         try:
             os.read(self._fd, 8)
         except BlockingIOError:
-            return  # put forward after it had become ready
+            return  # set again after it had become ready
         self._callback()
 
 
 class LoopTimer:
-    """A :class:`Timer` of the loop itself: under virtual time, and where there is no other."""
+    """A :class:`Timer` of the loop itself: under virtual time, and where there is no timerfd."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], object]) -> None:
         self._loop = loop
@@ -98,7 +98,7 @@ class LoopTimer:
 
 
 def timer(loop: asyncio.AbstractEventLoop, callback: Callable[[], object]) -> Timer:
-    """The best there is: the kernel's where the loop runs in real time, its own otherwise."""
+    """Return a kernel timer where the loop runs in real time and the system has one, else a timer of the loop."""
     if isinstance(loop, VirtualLoop):
         return LoopTimer(loop, callback)
     try:

@@ -1,6 +1,11 @@
-"""Taps: processes of their own that listen to the daemon's local stream and pass on what it tells in other forms.
+"""Taps: processes beside the daemon that read its local stream and publish it in other forms.
 
-Nothing of the daemon imports this room, and none of them runs in its process: a tap that hangs or crashes costs it a
-buffer. Libraries that only a tap needs are extras; `daemon.cli.parser` says which one is
-missing.
+No module of the daemon imports this room, and no tap runs in its process: a tap that hangs or crashes costs the
+daemon a buffer. Libraries that only a tap needs are extras; a command names the missing one. The packages:
+
+* ``view``: the web page. ``ros``: messages and a node of ROS 2. ``foxglove``: a live server. ``mcap``: MCAP files.
+* ``metrics``: Prometheus and VDA 5050 over HTTP. ``fleet``: several robots over Zenoh.
+* ``stream``: recordings as a stream, and the map assembled from tiles.
+
+Modules of the room itself are shared by the packages: ``access_guard``, ``command_client``, ``zenoh_session``.
 """

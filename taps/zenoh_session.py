@@ -1,8 +1,7 @@
-"""Sessions with a Zenoh router: one that is away is waited for, said once, and come back to.
+"""Sessions with a Zenoh router: connect, wait for an absent router, reconnect, query.
 
-Sessions are clients: everything passes through the router, nothing listens on the robot, and what was declared is
-declared again when the router is back. Calls that wait for the network are made in threads for which nobody waits at
-a stop.
+Sessions are clients: all data pass through the router, nothing listens on the robot, and Zenoh repeats all declarations
+after a reconnect. Blocking calls run in daemon threads, which do not delay a stop.
 """
 
 from __future__ import annotations
@@ -19,34 +18,34 @@ from typing import Any, Final, Protocol
 
 import zenoh
 
-from daemon.cli import parser
 from daemon.config.endpoints import in_url, parse_endpoint
-from hal.blocking_calls import beside
+from daemon.system import console
+from hal.blocking_calls import run_in_thread
 
 LEASE_S: Final = 5.0
-"""Who has been silent for so long is gone, for the other side; who does not answer so long is not there."""
+"""Lease: a peer that is silent for this long counts as gone; a connection attempt times out after it."""
 MOST_BYTES: Final = 257 << 20
-"""No message is larger: the largest map that a fleet shares, and its key. Zenoh's own limit is four times that."""
+"""Largest message: the largest map that a fleet shares, with its key. Zenoh's own limit is four times that."""
 PROTOCOLS: Final = ("tcp", "tls", "quic", "udp", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 RETRY_S: Final = 1.0
 CLOSE_S: Final = 2.0
-BEAT_S: Final = 0.5
-ASK_S: Final = 3.0
-"""A question to others is answered by then, or not at all."""
+POLL_S: Final = 0.5
+QUERY_S: Final = 3.0
+"""Time limit of a query."""
 
 Say = Callable[[str], None]
 OnRouter = Callable[[bool], None]
 
 
 class BadEndpoint(Exception):
-    """No session can ever be made so; the text says why and what to write."""
+    """An unusable endpoint or configuration; the text gives the cause and a remedy."""
 
 
 def locator(text: str) -> str:
     """Zenoh's name of an endpoint: ``HOST:PORT`` is TCP, anything with a slash is Zenoh's own, as in ``tls/host:7447``.
 
     Raises:
-        BadEndpoint: it is neither.
+        BadEndpoint: neither form.
     """
     if "/" in text:
         if (protocol := text.partition("/")[0]) not in PROTOCOLS:
@@ -59,16 +58,16 @@ def locator(text: str) -> str:
     return f"tcp/{in_url(host)}:{port}"
 
 
-def config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:
-    """What a session is opened with.
+def session_config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:
+    """The Zenoh configuration of a session.
 
     Args:
         mode: client or router.
-        endpoint: that a client connects to, that a router listens at.
-        file: of Zenoh's own configuration, for certificates and rights; what is said here counts more.
+        endpoint: to which a client connects, or at which a router listens.
+        file: Zenoh's own configuration, for certificates and access rights; the values of this function override it.
 
     Raises:
-        BadEndpoint: the endpoint or the file is not one.
+        BadEndpoint: an invalid endpoint or file.
     """
     side = "connect" if mode == "client" else "listen"
     try:
@@ -77,8 +76,8 @@ def config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:
             "mode": mode,
             f"{side}/endpoints": [locator(endpoint)],
             "scouting/multicast/enabled": False,
-            "transport/shared_memory/enabled": False,  # needs rights that a service does without
-            "timestamping/enabled": True,  # the caches for those who come late need it
+            "transport/shared_memory/enabled": False,  # needs rights that the service lacks
+            "timestamping/enabled": True,  # needed by the caches for late joiners
             "transport/link/rx/max_message_size": MOST_BYTES,
             "transport/link/tx/lease": round(1e3 * LEASE_S),
             "transport/unicast/open_timeout": round(1e3 * LEASE_S),
@@ -86,15 +85,15 @@ def config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.Config:
             made.insert_json5(key, json.dumps(value))
         _check_files(made)
     except zenoh.ZError as error:
-        raise BadEndpoint(f"{endpoint if file is None else f'{endpoint}, {file}'}: {words(error)}") from None
+        raise BadEndpoint(f"{endpoint if file is None else f'{endpoint}, {file}'}: {error_text(error)}") from None
     return made
 
 
 def _check_files(made: zenoh.Config) -> None:
-    """Whether certificates and keys are there and are such: of those, Zenoh says only that it cannot connect.
+    """Check that certificates and keys exist and are PEM: Zenoh reports only a failed connection.
 
     Raises:
-        BadEndpoint: one is not.
+        BadEndpoint: one is missing or invalid.
     """
     for key, path in json.loads(made.get_json("transport/link/tls")).items():
         if isinstance(path, str) and key.endswith(("certificate", "private_key")):
@@ -106,47 +105,47 @@ def _check_files(made: zenoh.Config) -> None:
                 raise BadEndpoint(f"{path} ({key}): no certificate or key in PEM form")
 
 
-def words(error: Exception) -> str:
-    """What a library's error says, without where in its sources."""
-    told = re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error))
-    message = re.search(r'msg: "(.*?)(?:"|$)', told)
-    return (message[1] if message else told).strip().rstrip(".!")
+def error_text(error: Exception) -> str:
+    """Message of a Zenoh error, without the position in its sources."""
+    text = re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error))
+    message = re.search(r'msg: "(.*?)(?:"|$)', text)
+    return (message[1] if message else text).strip().rstrip(".!")
 
 
 @contextlib.asynccontextmanager
-async def joined(router: str, file: Path | None = None, say: Say = parser.say) -> AsyncIterator[zenoh.Session]:
-    """A session with a router, as soon as there is one.
+async def open_session(router: str, file: Path | None = None, say: Say = console.say) -> AsyncIterator[zenoh.Session]:
+    """A client session with a router; waits until the router answers.
 
     Raises:
-        BadEndpoint: there can be none.
+        BadEndpoint: an invalid endpoint or file.
     """
-    made = config("client", router, file)
-    said = False
+    made = session_config("client", router, file)
+    reported = False
     while True:
         try:
-            session = await beside(partial(zenoh.open, made), "zenoh")
+            session = await run_in_thread(partial(zenoh.open, made), "zenoh")
             break
         except zenoh.ZError as error:
-            if not said:
-                say(f"no Zenoh router answers at {router}; waiting for it ({words(error)})")
-                said = True
+            if not reported:
+                say(f"no Zenoh router answers at {router}; waiting for it ({error_text(error)})")
+                reported = True
             await asyncio.sleep(RETRY_S)
-    if said:
+    if reported:
         say(f"the router at {router} is there")
     try:
         yield session
     finally:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_S):
-                await beside(session.close, "zenoh")
+                await run_in_thread(session.close, "zenoh")
 
 
-async def watched(session: zenoh.Session, router: str, on_router: OnRouter, say: Say = parser.say) -> None:
-    """Say when the router goes and when it is back, until cancelled; ``on_router`` is told, and at first."""
+async def watch_router(session: zenoh.Session, router: str, on_router: OnRouter, say: Say = console.say) -> None:
+    """Report loss and return of the router until cancelled; ``on_router`` receives its presence, also at the start."""
     there = True
     on_router(True)
     while True:
-        await asyncio.sleep(BEAT_S)
+        await asyncio.sleep(POLL_S)
         if bool(session.info.routers_zid()) == there:
             continue
         there = not there
@@ -154,40 +153,40 @@ async def watched(session: zenoh.Session, router: str, on_router: OnRouter, say:
         on_router(there)
 
 
-async def listed(session: zenoh.Session, key: str) -> list[str]:
-    """Liveliness tokens that there are."""
-    replies = await beside(lambda: list(session.liveliness().get(key, timeout=ASK_S)), "zenoh")
+async def list_tokens(session: zenoh.Session, key: str) -> list[str]:
+    """Keys of the present liveliness tokens."""
+    replies = await run_in_thread(lambda: list(session.liveliness().get(key, timeout=QUERY_S)), "zenoh")
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
 
-async def answers(
-    session: zenoh.Session, key: str, seconds: float = ASK_S, most: int | None = None
+async def query_all(
+    session: zenoh.Session, key: str, seconds: float = QUERY_S, most: int | None = None
 ) -> list[tuple[str, bytes, bytes]]:
-    """What everybody answers who is asked, the first ``most`` of it: key, content, attachment."""
+    """The first ``most`` replies of all queryables: key, content, attachment."""
 
     def ask() -> list[tuple[str, bytes, bytes]]:
         replies = session.get(
             key, target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE, timeout=seconds
         )
-        return [parts(reply.ok) for reply in islice(replies, most) if reply.ok is not None]
+        return [sample_parts(reply.ok) for reply in islice(replies, most) if reply.ok is not None]
 
-    return await beside(ask, "zenoh")
+    return await run_in_thread(ask, "zenoh")
 
 
 class Declared(Protocol):
     """A token, publisher, subscriber or queryable."""
 
     def undeclare(self) -> Any:  # the library's are not typed
-        """Be no more."""
+        """End the declaration."""
 
 
-def withdraw(*declared: Declared) -> None:
+def undeclare(*declared: Declared) -> None:
     """Undeclare these."""
     for one in declared:
         one.undeclare()
 
 
-def parts(sample: zenoh.Sample) -> tuple[str, bytes, bytes]:
+def sample_parts(sample: zenoh.Sample) -> tuple[str, bytes, bytes]:
     """Key, content, attachment."""
     attachment = sample.attachment
     return str(sample.key_expr), bytes(sample.payload), b"" if attachment is None else bytes(attachment)

@@ -14,23 +14,32 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.cli import parser
-from daemon.cli.replay import Given
-from daemon.commissioning.fit_plot import draw_calibration
-from daemon.commissioning.odometry import calibrate_wheels
+from daemon.commissioning.fit_plot import draw_calibration, draw_wheels
+from daemon.commissioning.odometry import configuration_lines, findings, fit_drive, with_mount
 from daemon.commissioning.teach_drive import Drive, heard, read_drive, rows_for
+from daemon.config import loader
 from daemon.config.loader import ConfigError, refuse_overwriting
 from daemon.config.residual_file import ResidualError, write_residuals
 from daemon.config.survey_loader import SurveyError, read_survey, residuals_beside, write_survey
-from estimator.calibration.calibrate import Calibrated, Estimate, TooLittle, calibrate
-from estimator.calibration.lamp_mapping import Heard, survey
-from estimator.calibration.observations import Rows
-from estimator.calibration.parameters import COMMONS, Common, Priors, placed
-from estimator.calibration.residual_map_fit import learn
-from estimator.calibration.survey_alignment import Unaligned, align
-from estimator.light_filter.residual_map import ResidualMap
-from estimator.light_filter.survey import Survey
-from estimator.measurements import Array
+from daemon.replay.recorded_inputs import Given
+from daemon.system import console
+from estimator import Array, ResidualMap, Survey
+from estimator.calibration import (
+    COMMONS,
+    Calibrated,
+    Common,
+    Estimate,
+    Heard,
+    Priors,
+    Rows,
+    TooLittle,
+    Unaligned,
+    align,
+    calibrate_lamps,
+    learn,
+    placed,
+    survey,
+)
 from hal.errors import HalError
 
 SURVEY_OUT = Path("lights-calibrated.toml")
@@ -53,7 +62,7 @@ def main(args: argparse.Namespace) -> int:
             return calibrate_wheels(drive, args)
         return _lights(args, drive)
     except (HalError, ConfigError, SurveyError, ResidualError, TooLittle, Unaligned) as error:
-        return parser.fail(f"{args.log}: {error}" if isinstance(error, ValueError) else str(error))
+        return console.fail(f"{args.log}: {error}" if isinstance(error, ValueError) else str(error))
 
 
 def _lights(args: argparse.Namespace, drive: Drive) -> int:
@@ -67,14 +76,14 @@ def _lights(args: argparse.Namespace, drive: Drive) -> int:
     if args.start:
         start[2] = math.radians(start[2])
     rows = rows_for(given, strengths, start)
-    found = calibrate(given, rows, FRAME, start)
+    found = calibrate_lamps(given, rows, FRAME, start)
     residuals = learn(found.survey, in_survey(found, found.rows))
     sys.stdout.write(report(found, residuals))
     write_survey(args.out, found.survey, notes(drive, found), remarks(found), force=args.force)
     beside = residuals_beside(args.out)
     write_residuals(beside, residuals, found.survey)
     sys.stdout.write(f"written: {args.out}, {beside}\n{draw_calibration(found, args.out.with_suffix('.png'))}\n")
-    return parser.OK
+    return console.OK
 
 
 def found_frame(given: Survey, strengths: Heard) -> Array:
@@ -147,3 +156,24 @@ def remarks(found: Calibrated) -> dict[int, str]:
         if e.lamp_id is not None and e.lamp_id not in found.untouched:
             said.setdefault(e.lamp_id, []).append(f"{e.name} +-{e.sigma:.3f}" if e.told else f"{e.name} not told")
     return {lamp: ", ".join(words) for lamp, words in said.items()}
+
+
+def calibrate_wheels(drive: Drive, args: argparse.Namespace) -> int:
+    """Fit, say it, and write configuration and picture; returns the exit code.
+
+    Args:
+        drive: with odometry in it.
+        args: ``odometry``, ``lidar_mount``: what is asked for; ``out``, ``force``: where the configuration goes.
+
+    Raises:
+        DataInvalid: no odometry in the recording, or too little motion.
+        ConfigError: the configuration cannot be written, or is there.
+    """
+    fit = fit_drive(drive)
+    found = findings(fit, args.odometry, args.lidar_mount)
+    config = with_mount(drive.config, fit) if args.lidar_mount else drive.config
+    sys.stdout.write("\n".join([*found, *(configuration_lines(config) if args.lidar_mount else ())]) + "\n")
+    head = [f"Configuration of the drive {drive.path.name}, calibrated from it (lumiloop calibrate).", *found]
+    loader.write(args.out, config, head, force=args.force)
+    sys.stdout.write(f"written: {args.out}\n{draw_wheels(fit, args.out.with_suffix('.png'))}\n")
+    return console.OK

@@ -12,9 +12,8 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from daemon.cli.parser import OK, USAGE, fail
-from estimator.cdma.air_interface import PROFILES, Profile
-from estimator.cdma.gold_codes import gold_codes
+from daemon.system.console import OK, USAGE, fail
+from estimator import PROFILES, Profile, gold_codes
 
 Row = tuple[int, str, str]
 """Number of a code, its chips, its half chips."""

@@ -6,11 +6,11 @@ import argparse
 import json
 import sys
 
-from daemon.cli import parser
 from daemon.config import loader
 from daemon.config.paths import stream_path
 from daemon.diagnosis.checks import CHECKS, Case, Finding, Level
 from daemon.diagnosis.host import Host
+from daemon.system import console
 
 _WORDS = {Level.GOOD: "good", Level.REMARK: "note", Level.FIX: "FIX"}
 
@@ -27,11 +27,11 @@ def examine(args: argparse.Namespace, host: Host) -> int:
     except loader.ConfigError as error:
         wrong = Finding("configuration", Level.FIX, str(error), "mend it; nothing else can be judged before")
         _tell([wrong], args.json)
-        return parser.USAGE
+        return console.USAGE
     case = Case(settings, args.config, host, host.listen(args.stream or stream_path(settings.name)))
     found = [finding for check in CHECKS for finding in check(case)]
     _tell(found, args.json)
-    return parser.FAILED if any(finding.level is Level.FIX for finding in found) else parser.OK
+    return console.FAILED if any(finding.level is Level.FIX for finding in found) else console.OK
 
 
 def _tell(found: list[Finding], as_json: bool) -> None:

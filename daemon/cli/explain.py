@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final
 
-from daemon.cli.parser import FAILED, OK, fail
 from daemon.config import loader
 from daemon.config.schema import Config
 from daemon.health.faults import FAULTS
@@ -22,6 +21,7 @@ from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.modbus import holding, integrity_block, registers
 from daemon.publish.modbus.points import Layout, Point
 from daemon.publish.modbus.requests import BLOCKS
+from daemon.system.console import FAILED, OK, fail
 
 _BLOCKS: Final = (
     ("input register", registers.BODY_ADDRESS, registers.BODY),

@@ -9,12 +9,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from daemon.cli import parser
 from daemon.config.paths import maps_folder, stream_path
 from daemon.config.schema import Config
 from daemon.diagnosis.host import Heard, Host, standing
 from daemon.diagnosis.lamp_history import BadHistory, by_lamp, in_maps, load, merged, save
 from daemon.diagnosis.lamp_trend import Verdict, judge, together
+from daemon.system import console
 
 FILE: Final = "lamps.csv"
 TOGETHER: Final = -0.02
@@ -30,12 +30,12 @@ def tell(args: argparse.Namespace, host: Host) -> int:
     """The same, on a given computer."""
     settings: Config = args.settings
     if not settings.map.kept and args.history is None:
-        return parser.fail("maps are not kept (`map.folder` is none), and so is nothing known of lamps", parser.USAGE)
+        return console.fail("maps are not kept (`map.folder` is none), and so is nothing known of lamps", console.USAGE)
     maps = maps_folder(settings.map.folder) if settings.map.kept else None
     path: Path = args.history or (maps.parent / FILE if maps is not None else Path(FILE))
     if args.history is not None and not path.parent.is_dir():
-        return parser.fail(
-            f"--history {path}: there is no folder {path.parent}; make it, or name another file", parser.USAGE
+        return console.fail(
+            f"--history {path}: there is no folder {path.parent}; make it, or name another file", console.USAGE
         )
     try:
         kept = load(path)
@@ -44,20 +44,20 @@ def tell(args: argparse.Namespace, host: Host) -> int:
         if looks != kept:
             save(path, looks)
     except BadHistory as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except OSError as error:
-        return parser.fail(
+        return console.fail(
             f"{error.filename or path}: {error.strerror}; run it as the daemon's user, or name --history FILE"
         )
     heard = host.listen(args.stream or stream_path(settings.name))
     verdicts = judge(by_lamp(looks), host.utc(), _said_of(heard) if isinstance(heard, Heard) else {})
     if not verdicts:
-        return parser.fail("nothing is known of any lamp yet: drive under surveyed lamps until the map has been saved")
+        return console.fail("nothing is known of any lamp yet: drive under surveyed lamps until the map has been saved")
     if not isinstance(heard, Heard):
         why = heard if isinstance(heard, str) else heard.text
-        parser.say(f"which lamps are dead or moved just now is not known, no daemon tells it: {why}")
+        console.say(f"which lamps are dead or moved just now is not known, no daemon tells it: {why}")
     sys.stdout.write(_as_json(verdicts) if args.json else _table(verdicts))
-    return parser.FAILED if any(one.urgent for one in verdicts) else parser.OK
+    return console.FAILED if any(one.urgent for one in verdicts) else console.OK
 
 
 def _said_of(heard: Heard) -> dict[int, int]:

@@ -8,22 +8,18 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Final
 
+from daemon.cli import tap_parsers
+from daemon.cli.command_body import Body, config_arguments, estimating, later, loaded
+from daemon.system.console import INTERRUPTED, OK, USAGE, fail
 from estimator.paper import LUMILOOP, METHODS
 
-OK: Final = 0
-FAILED: Final = 1
-USAGE: Final = 2
-INTERRUPTED: Final = 130
 LONGEST_RING: Final = 1440.0
 """Minutes; whoever wants more keeps all of it."""
 PICTURES: Final = (".png", ".svg", ".pdf")
 """Endings of files that can be drawn."""
-
-Body = Callable[[argparse.Namespace], int]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -43,18 +39,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return OK
 
 
-def fail(message: str, code: int = FAILED) -> int:
-    """Say on stderr what went wrong and return the exit code."""
-    sys.stderr.write(f"lumiloop: {message}\n")
-    return code
-
-
-def say(text: str) -> None:
-    """One line on stderr, at once."""
-    sys.stderr.write(f"lumiloop: {text}\n")
-    sys.stderr.flush()
-
-
 def parser() -> argparse.ArgumentParser:
     """Every command with its options; ``body`` of what it parses is the :data:`Body` to run."""
     parser = argparse.ArgumentParser(
@@ -66,8 +50,6 @@ def parser() -> argparse.ArgumentParser:
     _print_option(parser, "--schema", _schema, "the JSON schema of the configuration")
     _print_option(parser, "--reference", _reference, "the configuration's reference (Markdown)")
     _print_option(parser, "--print-config", _defaults, "every key of the configuration with its default")
-    from daemon.cli import tap_parsers
-
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     _run(commands.add_parser("run", help="read the sensors, publish the pose, until stopped"))
     _check(commands.add_parser("check", help="say whether a configuration file, and the survey it names, are good"))
@@ -91,14 +73,6 @@ def _print_option(parser: argparse.ArgumentParser, flag: str, text: Callable[[],
         return OK
 
     parser.add_argument(flag, action="store_const", const=body, dest="body", help=f"print {what}")
-
-
-def config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None:
-    """The options of every command that reads the configuration; see :func:`configured`."""
-    if file:
-        parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file; default: built-in values")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrule one key")
-    parser.add_argument("--print-config", action="store_true", help="print the resolved configuration and stop")
 
 
 def _run(parser: argparse.ArgumentParser) -> None:
@@ -199,7 +173,7 @@ def _map(parser: argparse.ArgumentParser) -> None:
     export.add_argument("--tum", action="store_true", help="keyframes.tum: where the keyframes of a map file lie")
     export.add_argument("--carmen", action="store_true", help="keyframes.clf: and their scans")
     config_arguments(export)
-    export.set_defaults(body=estimating("daemon.cli.map_export", "main"))
+    export.set_defaults(body=estimating("daemon.cli.maps.export", "main"))
     taken = verbs.add_parser("import", help="make a map to be localised in of one of map_server's or nav2's")
     taken.add_argument("yaml", type=Path, metavar="YAML", help="the description; the picture lies beside it")
     taken.add_argument("--name", metavar="TEXT", help="floor or building; default: the file's name")
@@ -207,20 +181,20 @@ def _map(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="FILE", help="default: the configured folder of maps; the next start takes it"
     )
     config_arguments(taken)
-    taken.set_defaults(body=estimating("daemon.cli.map_convert", "take_in", "warm-plan"))
+    taken.set_defaults(body=estimating("daemon.cli.maps.convert", "take_in", "warm-plan"))
     render = verbs.add_parser("render", help="draw a map file as a picture")
     render.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     render.add_argument("out", type=Path, metavar="PNG", help="picture to write")
     config_arguments(render)
-    render.set_defaults(body=estimating("daemon.cli.map_convert", "render", "warm-plan"))
+    render.set_defaults(body=estimating("daemon.cli.maps.convert", "render", "warm-plan"))
     _map_changes(verbs)
     info = verbs.add_parser("info", help="say what a map file holds")
     info.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     info.add_argument("--json", action="store_true", help="machine-readable output")
-    info.set_defaults(body=loaded("daemon.cli.map_info", "info"))
+    info.set_defaults(body=loaded("daemon.cli.maps.info", "info"))
     verify = verbs.add_parser("verify", help="say whether map files are whole and consistent")
     verify.add_argument("maps", type=Path, nargs="+", metavar="FILE", help="map files, *.lumimap")
-    verify.set_defaults(body=loaded("daemon.cli.map_info", "verify"))
+    verify.set_defaults(body=loaded("daemon.cli.maps.info", "verify"))
 
 
 def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -243,7 +217,7 @@ def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
             metavar="FILE",
             help="default: beside FILE, as the newest; the daemon there has to be stopped",
         )
-        parser.set_defaults(body=loaded("daemon.maps.edit", verb))
+        parser.set_defaults(body=loaded("daemon.cli.maps.edit", verb))
 
 
 def _calibrate(parser: argparse.ArgumentParser) -> None:
@@ -280,57 +254,6 @@ def _codes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--code", type=int, metavar="N", help="this one only; default: all")
     parser.add_argument("--format", choices=("c", "csv", "json"), default="csv", help="default: csv")
     parser.set_defaults(body=loaded("daemon.cli.codes", "main"))
-
-
-def later(module: str, name: str) -> Body:
-    """A body that resolves the configuration (``args.settings``, a `Config`) and then loads its module."""
-    return configured(loaded(module, name))
-
-
-def estimating(module: str, name: str, what: str = "warm") -> Body:
-    """As `later`, for a module that imports ``what`` of the estimator: the minute that it may compile is announced."""
-
-    def body(args: argparse.Namespace) -> int:
-        from daemon.runtime import warmup
-
-        try:
-            warmup.load_aloud(say, what, warmup.load, module)
-        except warmup.CannotLoad as error:
-            return fail(str(error))
-        return loaded(module, name)(args)
-
-    return configured(body)
-
-
-def loaded(module: str, name: str) -> Body:
-    """A body that loads its module when it runs."""
-
-    def body(args: argparse.Namespace) -> int:
-        run: Body = getattr(import_module(module), name)
-        return run(args)
-
-    return body
-
-
-def configured(body: Body) -> Body:
-    """A body that is run with the resolved configuration as ``args.settings``."""
-
-    def resolve_and_run(args: argparse.Namespace) -> int:
-        from daemon.config import loader
-
-        overrides = list(args.set)
-        if getattr(args, "lidar", None):
-            overrides.append(f"lidar.device={args.lidar}")
-        try:
-            args.settings = loader.load(args.config, overrides)
-        except loader.ConfigError as error:
-            return fail(str(error), USAGE)
-        if args.print_config:
-            sys.stdout.write(loader.dump(args.settings))
-            return OK
-        return body(args)
-
-    return resolve_and_run
 
 
 def _version() -> str:

@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 
-from daemon.cli import parser
 from daemon.commissioning import plan_plot
 from daemon.commissioning.floor import Array, Hall, NoHall, read_hall
 from daemon.commissioning.lamp_selection import Goals, Plan, choose, codes_for, plan_of
@@ -21,8 +20,9 @@ from daemon.config.survey_loader import SurveyError, dump, read_survey
 from daemon.config.survey_schema import last_code
 from daemon.devices.photodiode import profile_of
 from daemon.replay.results import Folder, OutputRefused
+from daemon.system import console
 from daemon.system.extras import how_to_install
-from estimator.light_filter.survey import Lamp, Receiver, Survey
+from estimator import Lamp, Receiver, Survey
 
 HEADROOM_M: Final = 0.2
 HIGHEST_M: Final = 30.0
@@ -33,7 +33,7 @@ OPEN_M: Final = 1.0
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if wrong := _wrong(args):
-        return parser.fail(wrong, parser.USAGE)
+        return console.fail(wrong, console.USAGE)
     try:
         survey = _hung(args)
         receiver = survey.receiver if survey is not None else _receiver(args.settings)
@@ -48,12 +48,12 @@ def main(args: argparse.Namespace) -> int:
         sys.stdout.write(report(hall, plan, goals, fitting))
         _write(args, hall, plan, receiver, survey is None)
         if survey is None and (short := plan.short_of(goals)):
-            return parser.fail(
+            return console.fail(
                 f"{short}: plan parts of the hall apart, or lower the goals (--share, --links, --accuracy)"
             )
     except (NoHall, SurveyError, OutputRefused, ValueError) as error:
-        return parser.fail(str(error))
-    return parser.OK
+        return console.fail(str(error))
+    return console.OK
 
 
 def _wrong(args: argparse.Namespace) -> str:
@@ -170,7 +170,7 @@ def _write(args: argparse.Namespace, hall: Hall, plan: Plan, receiver: Receiver,
         if math.isfinite(apart):
             sys.stdout.write(f"codes are used again, {apart:.1f} m apart at least\n")
     if (drawn := plan_plot.draw(hall, plan)) is None:
-        parser.say(f"pictures need matplotlib: {how_to_install('plot')}")
+        console.say(f"pictures need matplotlib: {how_to_install('plot')}")
     else:
         folder.write("plan.png", drawn)
         sys.stdout.write(f"{folder.path / 'plan.png'}: links, accuracy, blind axes\n")

@@ -5,16 +5,16 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import re
 import sys
 
-from daemon.cli import parser
-from daemon.config.endpoints import LidarPlace, parse_lidar
+from daemon.config.endpoints import LidarPlace, is_bus, parse_lidar
+from daemon.system import console
 from hal.bus import i2c_linux
+from hal.bus.opening import open_bus
 from hal.hokuyo import discover
+from hal.hokuyo.probe import Finding, identify_at
 from hal.photodiode.probe import BusFinding, Chip, probe_bus
-from hal.port.opening import open_bus, open_port
-from hal.probe import Finding, identify_at
+from hal.port.opening import open_port
 
 NOTHING = (
     "nothing to look at: no serial device that may be a HOKUYO is plugged in, and there is no I2C bus\n"
@@ -36,17 +36,12 @@ def main(args: argparse.Namespace) -> int:
     try:
         places = {device: LidarPlace(device) if is_bus(device) else parse_lidar(device) for device in devices}
     except ValueError as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     findings = asyncio.run(_look(places, quiet=args.json))
     if args.json:
         sys.stdout.write(json.dumps([as_dict(finding) for finding in findings], indent=2) + "\n")
     good = sum(map(_usable, findings))
     return 0 if good and (not args.devices or good == len(findings)) else 1
-
-
-def is_bus(device: str) -> bool:
-    """Whether this is the name of an I2C bus; ``tcp://`` names a lidar here, so such a bus is named ``i2c+tcp://``."""
-    return re.match(r"/dev/i2c-|adapter:|unix:|i2c\+tcp://", device) is not None
 
 
 async def _look(places: dict[str, LidarPlace], quiet: bool) -> list[Found]:

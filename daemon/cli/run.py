@@ -14,16 +14,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.app import EXTEND_US, Daemon
-from daemon.cli.parser import FAILED, OK, USAGE
 from daemon.config import loader
 from daemon.config.paths import maps_folder, runtime_folder, streams_served
 from daemon.config.schema import Config
+from daemon.config.survey_loader import SurveyError
+from daemon.devices.light_setup import load_lights
 from daemon.devices.sample_clock import SampleClock
-from daemon.environment import World
-from daemon.maps.store import NoMap, started
-from daemon.runtime.light_setup import SurveyError, load_lights
+from daemon.environment import Environment
+from daemon.maps.initial_state import NoMap, started
 from daemon.runtime.stall_watch import StallWatch
 from daemon.runtime.warmup import CannotLoad, warm_up
+from daemon.system.console import FAILED, OK, USAGE
 from daemon.system.logging import start_log
 from daemon.system.realtime import give_back
 from daemon.system.sd_notify import managed, notify
@@ -56,14 +57,14 @@ def main(args: argparse.Namespace) -> int:
     recorder = None
     give_back()
     try:
-        world = _world(settings)
-        log.info("%s", _whereabouts(settings, args.record, world.stream))
+        environment = _environment(settings)
+        log.info("%s", _whereabouts(settings, args.record, environment.stream))
         if args.record is not None:
             from daemon.recording.recorder import Recorder
 
             keep_s = math.inf if args.last is None else 60.0 * args.last
-            recorder = Recorder(args.record, settings, world.clock, world.lights, world.start, keep_s)
-        asyncio.run(_run_until_signal(settings, world, recorder))
+            recorder = Recorder(args.record, settings, environment.clock, environment.lights, environment.start, keep_s)
+        asyncio.run(_run_until_signal(settings, environment, recorder))
     except SurveyError as error:
         log.error("%s", error)
         return USAGE
@@ -82,17 +83,17 @@ def _wait_before_anew() -> None:
         time.sleep(ANEW_S)
 
 
-def _world(settings: Config) -> World:
+def _environment(settings: Config) -> Environment:
     """The real one, with what is stored and surveyed of map and lights; raises `SurveyError` and `NoMap`."""
     stream = runtime_folder() / f"{settings.name}.stream"
     if not settings.photodiode.fitted:
         store, start = started(settings.map, None)
-        return World(SystemClock(), store=store, start=start, stream=stream)
+        return Environment(SystemClock(), store=store, start=start, stream=stream)
     clock = SampleClock(settings.photodiode)
     lights = load_lights(settings, clock.ppm)
     store, start = started(settings.map, lights)
-    world = World(SystemClock(), store=store, start=start, stream=stream)
-    return replace(world, warm_up=partial(warm_up, lights=lights), lights=lights, sample_clock=clock)
+    environment = Environment(SystemClock(), store=store, start=start, stream=stream)
+    return replace(environment, warm_up=partial(warm_up, lights=lights), lights=lights, sample_clock=clock)
 
 
 def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> str:
@@ -109,11 +110,11 @@ def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> 
     return f"{'; '.join(said)}; Ctrl-C or SIGTERM stops"
 
 
-async def _run_until_signal(settings: Config, world: World, recorder: Recorder | None) -> None:
+async def _run_until_signal(settings: Config, environment: Environment, recorder: Recorder | None) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    daemon = Daemon(settings, world, recorder)
+    daemon = Daemon(settings, environment, recorder)
     daemon.pacemaker.watch = StallWatch()
     await daemon.run(stop)

@@ -5,20 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 
-from daemon.cli import parser
-from daemon.cli.replay import Given
 from daemon.commissioning.fit_plot import draw_survey
 from daemon.commissioning.teach_drive import heard, read_drive
 from daemon.config.survey_loader import SurveyError, write_survey
-from estimator.calibration.calibrate import TooLittle
-from estimator.calibration.lamp_mapping import Surveyed, survey
+from daemon.replay.recorded_inputs import Given
+from daemon.system import console
+from estimator.calibration import Surveyed, TooLittle, survey
 from hal.errors import HalError
 
 
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.out.exists() and not args.force:
-        return parser.fail(
+        return console.fail(
             f"{args.out} exists: name another file with --out, or ask for it to be replaced with --force"
         )
     keys = tuple(override.partition("=")[0].strip() for override in args.set)
@@ -35,10 +34,10 @@ def main(args: argparse.Namespace) -> int:
         write_survey(args.out, found.found.survey, head, remarks(found), force=args.force)
         sys.stdout.write(f"written: {args.out}\n{draw_survey(found, args.out.with_suffix('.png'))}\n")
     except (HalError, SurveyError) as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except (TooLittle, ValueError) as error:
-        return parser.fail(f"{args.log}: {error}")
-    return parser.OK
+        return console.fail(f"{args.log}: {error}")
+    return console.OK
 
 
 def report(found: Surveyed, height: float | None) -> str:

@@ -7,16 +7,13 @@ extra of the package, and who lacks it is told which.
 from __future__ import annotations
 
 import argparse
-from importlib import import_module
 from pathlib import Path
 
-from daemon.cli import parser as cli_parser
-from daemon.system.extras import how_to_install
+from daemon.cli.command_body import config_arguments, estimating, later, listening, loaded, needing
 
 Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse has no public name for it
 MOST_DOMAIN = 232
 """The ports of a larger one would be beyond 65535 (DDS)."""
-OURS = ("daemon", "estimator", "hal", "taps")
 
 
 def add(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -37,19 +34,19 @@ def _lamps(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--history", type=Path, metavar="FILE", help="default: lamps.csv beside the folder of maps")
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     listening(parser)
-    parser.set_defaults(body=cli_parser.later("daemon.cli.lamps", "main"))
+    parser.set_defaults(body=later("daemon.cli.lamps", "main"))
 
 
 def _metrics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", default="127.0.0.1:9464", metavar="HOST:PORT", help="default: 127.0.0.1:9464")
     listening(parser)
-    parser.set_defaults(body=cli_parser.later("taps.metrics.server", "main"))
+    parser.set_defaults(body=later("taps.metrics.server", "main"))
 
 
 def _foxglove(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", default="127.0.0.1:8765", metavar="HOST:PORT", help="default: 127.0.0.1:8765")
     listening(parser)
-    parser.set_defaults(body=needing("foxglove", "taps.foxglove_live", "main"))
+    parser.set_defaults(body=needing("foxglove", "taps.foxglove.live", "main"))
 
 
 def _ros2(parser: argparse.ArgumentParser) -> None:
@@ -68,7 +65,7 @@ def _fleet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="and draw it")
     _meeting(parser)
-    cli_parser.config_arguments(parser)
+    config_arguments(parser)
     parser.set_defaults(body=needing("zenoh", "taps.fleet.show", "main"))
     verbs = parser.add_subparsers(title="verbs", metavar="VERB")
     join = verbs.add_parser("join", help="tell the fleet what this robot's daemon tells, until stopped")
@@ -81,18 +78,18 @@ def _fleet(parser: argparse.ArgumentParser) -> None:
     share.add_argument(
         "--version", type=int, metavar="N", help="larger is newer; default: when the file was changed, s"
     )
-    cli_parser.config_arguments(share)
+    config_arguments(share)
     share.set_defaults(body=needing("zenoh", "taps.fleet.share", "main"))
     fetch = verbs.add_parser("fetch", help="take what is offered, check it, put it to its place")
     fetch.add_argument("what", nargs="*", type=_shared, metavar="survey|map", help="default: both")
     fetch.add_argument("--survey", type=Path, metavar="FILE", help="where the survey goes; default: `lights.survey`")
     fetch.add_argument("--switch", action="store_true", help="have the running daemon go on in the map (SWITCH_MAP)")
     fetch.add_argument("--follow", action="store_true", help="take newer ones, too, until stopped")
-    cli_parser.config_arguments(fetch)
+    config_arguments(fetch)
     fetch.set_defaults(body=needing("zenoh", "taps.fleet.fetch", "main"))
     router = verbs.add_parser("router", help="be the router that they all meet at, until stopped")
     router.add_argument("--listen", default="127.0.0.1:7447", metavar="HOST:PORT", help="default: 127.0.0.1:7447")
-    cli_parser.config_arguments(router)
+    config_arguments(router)
     router.set_defaults(body=needing("zenoh", "taps.fleet.share", "router"))
     for verb in (join, share, fetch, router):
         _meeting(verb)
@@ -162,14 +159,14 @@ def _plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("plan"), metavar="DIR", help="for lights.toml and plan.png; plan"
     )
-    cli_parser.config_arguments(parser)
-    parser.set_defaults(body=cli_parser.later("daemon.cli.plan", "main"))
+    config_arguments(parser)
+    parser.set_defaults(body=later("daemon.cli.plan", "main"))
 
 
 def _doctor(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     listening(parser)
-    parser.set_defaults(body=cli_parser.loaded("daemon.cli.doctor", "main"))
+    parser.set_defaults(body=loaded("daemon.cli.doctor", "main"))
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
@@ -179,8 +176,8 @@ def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kitti", type=Path, metavar="FILE", help="trajectory: 12 numbers of a matrix a line")
     parser.add_argument("--online", action="store_true", help="trajectories as published, not as known at the end")
     parser.add_argument("--force", action="store_true", help="replace an MCAP file that is there")
-    cli_parser.config_arguments(parser)
-    parser.set_defaults(body=cli_parser.estimating("taps.mcap.export", "main"))
+    config_arguments(parser)
+    parser.set_defaults(body=estimating("taps.mcap.export", "main"))
 
 
 def _record_mcap(parser: argparse.ArgumentParser) -> None:
@@ -203,27 +200,3 @@ def _view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--token", type=Path, metavar="FILE", help="that holds the token; default: a new one each time")
     listening(parser)
     parser.set_defaults(body=needing("view", "taps.view.command", "main"))
-
-
-def listening(parser: argparse.ArgumentParser) -> None:
-    """The options that say which daemon to listen to; ``args.stream``: Path or None for the configuration's."""
-    parser.add_argument(
-        "--stream", type=Path, metavar="SOCKET", help="the daemon's local stream; default: that of the configured name"
-    )
-    cli_parser.config_arguments(parser)
-
-
-def needing(extra: str, module: str, name: str) -> cli_parser.Body:
-    """A body that resolves the configuration and then loads its module, which needs an extra of the package."""
-
-    def body(args: argparse.Namespace) -> int:
-        try:
-            import_module(module)
-        except ModuleNotFoundError as error:
-            missing = (error.name or "").partition(".")[0]
-            if missing in OURS:
-                raise
-            return cli_parser.fail(f"this command needs {missing}, which is not installed: {how_to_install(extra)}")
-        return cli_parser.loaded(module, name)(args)
-
-    return cli_parser.configured(body)

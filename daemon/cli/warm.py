@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from daemon.cli import parser
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError
 from daemon.runtime import warmup
+from daemon.system import console
 
 if TYPE_CHECKING:
-    from daemon.runtime.light_setup import Lights
+    from daemon.devices.light_setup import Lights
 
 
 def main(args: argparse.Namespace) -> int:
@@ -24,21 +24,21 @@ def main(args: argparse.Namespace) -> int:
     try:
         lights = _lights(settings)
         if warmup.is_warm(lights is not None):
-            parser.say("an earlier start has compiled the kernels")
-            return parser.OK
+            console.say("an earlier start has compiled the kernels")
+            return console.OK
         warmth = warmup.load(lights)
     except SurveyError as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except warmup.CannotLoad as error:
-        return parser.fail(str(error))
-    parser.say(f"kernels compiled in {warmth.seconds:.1f} s")
-    return parser.OK
+        return console.fail(str(error))
+    console.say(f"kernels compiled in {warmth.seconds:.1f} s")
+    return console.OK
 
 
 def _lights(settings: Config) -> Lights | None:
     """What the configuration says of them; where it says nothing, numpy is not loaded to learn that."""
     if not (settings.photodiode.fitted or settings.lights.survey):
         return None
-    from daemon.runtime.light_setup import load_lights
+    from daemon.devices.light_setup import load_lights
 
     return load_lights(settings)

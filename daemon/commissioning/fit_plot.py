@@ -8,9 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.system.extras import how_to_install
-from estimator.calibration.calibrate import Calibrated
-from estimator.calibration.lamp_mapping import Surveyed
-from estimator.calibration.odometry_calibration import WheelFit
+from estimator.calibration import Calibrated, Surveyed, WheelFit
 
 _MISSING: Final = f"no picture: matplotlib is not installed ({how_to_install('plot')})"
 

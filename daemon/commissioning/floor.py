@@ -82,11 +82,11 @@ def read_hall(path: Path, spacing: float) -> Hall:
 
 
 def _of_map(path: Path) -> tuple[Trinary, float, tuple[float, float, float]]:
-    from daemon.cli.map_convert import grid_of
     from daemon.maps.container import BadMap
     from daemon.maps.edit import opened
+    from daemon.maps.grid_files import greys
     from daemon.maps.image import image_from
-    from daemon.replay.results import greys
+    from daemon.maps.image_geometry import grid_of
 
     try:
         grid = grid_of(image_from(opened(path)))

@@ -1,46 +1,20 @@
-"""`lumiloop calibrate REC --odometry --lidar-mount`: wheels and laser mount, as text, configuration and picture."""
+"""Calibration of odometry and laser mount from a drive, and its findings as text and configuration."""
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 from typing import Final
 
 import numpy as np
 from msgspec.structs import replace
 
-from daemon.cli import parser
-from daemon.commissioning.fit_plot import draw_wheels
 from daemon.commissioning.teach_drive import Drive, poses_at
-from daemon.config import loader
 from daemon.config.schema import Config
-from estimator.calibration.odometry_calibration import Wheel, WheelFit, fit_wheels, on_base
+from estimator.calibration import Wheel, WheelFit, fit_wheels, on_base
 from hal.errors import DataInvalid
 
 _ODOMETRY: Final = (Wheel.SCALE, Wheel.TURN, Wheel.DRIFT)
 _MOUNT: Final = (Wheel.MOUNT_X, Wheel.MOUNT_Y, Wheel.MOUNT_YAW)
-
-
-def calibrate_wheels(drive: Drive, args: argparse.Namespace) -> int:
-    """Fit, say it, and write configuration and picture; returns the exit code.
-
-    Args:
-        drive: with odometry in it.
-        args: ``odometry``, ``lidar_mount``: what is asked for; ``out``, ``force``: where the configuration goes.
-
-    Raises:
-        DataInvalid: no odometry in the recording, or too little motion.
-        ConfigError: the configuration cannot be written, or is there.
-    """
-    fit = fit_drive(drive)
-    found = findings(fit, args.odometry, args.lidar_mount)
-    config = with_mount(drive.config, fit) if args.lidar_mount else drive.config
-    sys.stdout.write("\n".join([*found, *(_paste(config) if args.lidar_mount else ())]) + "\n")
-    head = [f"Configuration of the drive {drive.path.name}, calibrated from it (lumiloop calibrate).", *found]
-    loader.write(args.out, config, head, force=args.force)
-    sys.stdout.write(f"written: {args.out}\n{draw_wheels(fit, args.out.with_suffix('.png'))}\n")
-    return parser.OK
 
 
 def findings(fit: WheelFit, odometry: bool, mount: bool) -> list[str]:
@@ -66,7 +40,8 @@ def _rounded(value: float, decimals: int) -> float:
     return round(float(value), decimals) + 0.0  # no -0.0
 
 
-def _paste(config: Config) -> list[str]:
+def configuration_lines(config: Config) -> list[str]:
+    """The mount as lines of the configuration file."""
     mount = config.lidar.mount
     return ["", "[lidar.mount]", f"x = {mount.x:.4f}", f"y = {mount.y:.4f}", f"yaw = {mount.yaw:.3f}", ""]
 

@@ -14,19 +14,14 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from daemon.cli.replay import Given, config_for, lights_for
 from daemon.config.schema import Config
 from daemon.devices.conversion import SampleBridge
+from daemon.replay.recorded_inputs import Given, config_for, lights_for
 from daemon.replay.results import Trajectory
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import Source, open_log
-from estimator.calibration.lamp_mapping import Heard
-from estimator.calibration.observations import Rows
-from estimator.cdma import decoder as cdma_decoder
-from estimator.cdma.air_interface import Profile
-from estimator.cdma.epoch import UNUSABLE, LightEpoch
-from estimator.light_filter.survey import Survey
-from estimator.measurements import Array
+from estimator import UNUSABLE, Array, LightEpoch, Profile, Survey, decode, new_decoder, search
+from estimator.calibration import Heard, Rows
 from hal.adc import RawSamples
 from hal.errors import DataInvalid, HalError
 from hal.odometry import RawOdometry
@@ -79,14 +74,14 @@ def read_drive(path: Path, settings: Config, given: Given) -> Drive:
     drive.config, drive.profile = used, None if lights is None else lights.profile
     rerun, readings = Rerun(source, used), []
     bridge = None if lights is None else SampleBridge(lights.profile)
-    decoder = None if lights is None else cdma_decoder.new_decoder(lights.profile, lights.clock_ppm)
+    decoder = None if lights is None else new_decoder(lights.profile, lights.clock_ppm)
     try:
         for event in source.events():
             if isinstance(event, RawSamples):
                 block = None if bridge is None else bridge.block(event)
                 if block is not None and decoder is not None:
-                    epoch = cdma_decoder.decode(decoder, block)
-                    cdma_decoder.search(decoder, SEARCH_CODES)
+                    epoch = decode(decoder, block)
+                    search(decoder, SEARCH_CODES)
                     drive.epochs.append((source.utc(0.5 * (epoch.t_begin + epoch.t_end)), epoch))
                 continue
             if isinstance(event, RawOdometry):

@@ -151,3 +151,8 @@ def interface_of(bind: str) -> str:
     """The network that `bind` names, for datagrams to groups; empty: none of its own (all, loopback, IPv6)."""
     address = ipaddress.ip_address(bind)
     return bind if address.version == 4 and not address.is_unspecified and not address.is_loopback else ""
+
+
+def is_bus(device: str) -> bool:
+    """Whether this is the name of an I2C bus; ``tcp://`` names a lidar here, so such a bus is named ``i2c+tcp://``."""
+    return re.match(r"/dev/i2c-|adapter:|unix:|i2c\+tcp://", device) is not None

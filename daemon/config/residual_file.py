@@ -18,8 +18,7 @@ import numpy as np
 
 from daemon.config.survey_loader import dump
 from daemon.system.atomic_file import write_whole
-from estimator.light_filter.residual_map import ResidualMap
-from estimator.light_filter.survey import Survey
+from estimator import ResidualMap, Survey
 
 VERSION: Final = 1
 _DAMAGE: Final = (

@@ -17,7 +17,7 @@ import msgspec
 
 from daemon.config.errors import Option, options, value_text, written, wrong_value
 from daemon.config.survey_schema import LampEntry, ReceiverEntry, SurveyTree, last_code
-from estimator.cdma.air_interface import Profile
+from estimator import Profile
 
 NEAREST_M: Final = 0.01
 """Two lamps closer than this are one lamp written twice."""

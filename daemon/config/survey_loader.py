@@ -19,8 +19,7 @@ import msgspec
 from daemon.config.survey_errors import problems
 from daemon.config.survey_schema import SurveyTree
 from daemon.system.atomic_file import write_whole
-from estimator.cdma.air_interface import Profile
-from estimator.light_filter.survey import Lamp, Receiver, Survey
+from estimator import Lamp, Profile, Receiver, Survey
 
 DECIMALS: Final = 6
 

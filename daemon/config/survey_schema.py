@@ -12,8 +12,7 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
-from estimator.cdma.air_interface import PROFILES, Profile
-from estimator.light_filter.survey import Lamp, Receiver, Survey
+from estimator import PROFILES, Lamp, Profile, Receiver, Survey
 
 Slope = Annotated[float, Meta(ge=-1.0, le=1.0)]
 Metres = Annotated[float, Meta(ge=-10_000.0, le=10_000.0)]

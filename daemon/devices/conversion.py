@@ -14,9 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from daemon.config.schema import LidarConfig
-from estimator.cdma.air_interface import Profile
-from estimator.measurements import Array, Beam, Imu, Odometry, SampleBlock, Scan
-from estimator.numerics import se2
+from estimator import Array, Beam, Imu, Odometry, Profile, SampleBlock, Scan, se2
 from hal.adc import Blemish, RawSamples
 from hal.imu import RawImu
 from hal.lidar import VALID, LidarGeometry, RawScan

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, Protocol
 
 from daemon.config.schema import PhotodiodeConfig, parse_chip
-from estimator.cdma.air_interface import PROFILES, Profile
+from estimator import PROFILES, Profile
 from hal.adc import Adc, AdcStatus, RawSamples
 from hal.bus.i2c import BusOpener
 from hal.clock import Clock

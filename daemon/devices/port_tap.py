@@ -1,4 +1,4 @@
-"""Ports that somebody listens in on: the recording, and whoever has asked for the raw bytes."""
+"""Taps on ports: pass every byte on to the recording and to the clients of raw bytes."""
 
 from __future__ import annotations
 

@@ -11,14 +11,14 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
-from daemon.cli.check import Maps, implausible, look_at_maps
-from daemon.cli.probe import is_bus
-from daemon.config.endpoints import ANYBODY, AUTO, parse_endpoint, subscription_port
+from daemon.config.endpoints import ANYBODY, AUTO, is_bus, parse_endpoint, subscription_port
 from daemon.config.loader import naming
 from daemon.config.paths import can_be_made, maps_folder, runtime_folder, state_folder, stream_path
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError, read_survey
+from daemon.diagnosis.configuration import implausible
 from daemon.diagnosis.host import Heard, Host, Mute, standing
+from daemon.diagnosis.map_folder import Maps, look_at_maps
 from daemon.snapshot import LinkUse, State
 from hal.net.inet import refusal
 

@@ -1,4 +1,4 @@
-"""What a check may ask: of the computer, of its devices, and of the daemon, if one runs. Tests have their own."""
+"""The host that the checks query: the computer, its devices, and a running daemon. Tests replace it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from pathlib import Path
 from typing import Final
 
 from daemon.health.faults import Fault
+from daemon.publish.stream.client import Stream
+from daemon.publish.stream.messages import Faults, Hello, Lights, NotTheStream, Pose, StateChange
 from daemon.snapshot import LinkUse
 from hal.bus import i2c_linux
+from hal.bus.opening import open_bus
 from hal.hokuyo import discover
+from hal.hokuyo.probe import Finding, identify_at
 from hal.photodiode.probe import BusFinding, probe_bus
-from hal.port.opening import open_bus, open_port
-from hal.probe import Finding, identify_at
-from taps.stream.client import Stream
-from taps.stream.messages import Faults, Hello, Lights, NotTheStream, Pose, StateChange
+from hal.port.opening import open_port
 
 LISTEN_S: Final = 3.0
 LISTENERS: Final = "lumiloop-stream"

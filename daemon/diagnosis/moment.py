@@ -8,11 +8,12 @@ from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 from daemon.health.reasons import Reason
-from daemon.integrity.motion_consistency import Told as Wheels
+from daemon.integrity.motion_consistency import MotionComparison as Wheels
 from daemon.recording.recorder import CycleEntry
-from daemon.runtime.cycle import Cycle, CycleRecord
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.snapshot import Snapshot, State
-from estimator.result import StepResult
+from estimator import StepResult
 
 SECOND_S: Final = 1.0
 """A time without a fraction, as the journal writes it, is of all that came in this long."""
@@ -62,7 +63,7 @@ def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle:
         result=record.result,
         scan=record.scan,
         fresh=record.limits is not None,
-        wheels=cycle.observer.witnesses.told(),
+        wheels=cycle.observer.motion_consistency.compared(),
         dropped=len(record.dropped),
         orders=tuple(command.order for command in entry.commands),
         told=entry.reason,

@@ -13,9 +13,7 @@ import numpy as np
 from daemon.diagnosis.moment import Moment, at, clock, faults_changed
 from daemon.diagnosis.moment_report import AXES, GAP, laser_dissents, light_apart
 from daemon.snapshot import LinkUse, State
-from estimator.mapping.occupancy_grid import Grid
-from estimator.measurements import Array
-from estimator.numerics import se2
+from estimator import Array, Grid, se2
 
 _INCHES: Final = (14.0, 8.0)
 _MARGIN_M: Final = 4.0

@@ -15,8 +15,7 @@ from daemon.health.faults import FAULTS, Fault
 from daemon.health.reasons import REASONS, Reason
 from daemon.publish.meanings import USES
 from daemon.snapshot import LightLink, LinkUse, Snapshot, State
-from estimator.measurements import Array
-from estimator.numerics import se2
+from estimator import Array, se2
 
 AXES: Final = ("x", "y", "heading")
 GAP: Final = 16.27

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 from daemon.health.faults import Fault
+from daemon.health.present_faults import PresentFaults
 from daemon.health.supervisor import Supervisor
-from daemon.health.thread_watch import Answers
+from daemon.health.thread_watch import ThreadWatch
 from daemon.snapshot import Condition, Part
 from hal.adc import AdcStatus
 from hal.clock import Clock
@@ -32,26 +32,26 @@ class Reporter:
     """Makes the condition anew once a second, and when the faults change; in between it is the same object.
 
     Args:
-        clock: of the daemon. supervisor, answers: what they know. faults: those that are present, gravest first.
-        lidar, adc: status of the drivers; None: there is none.
+        clock: of the daemon. supervisor: restarts of parts. threads: those that hang. faults: those that are present.
+        drivers: status of lidar and converter; None: there is none.
     """
 
     def __init__(
         self,
         clock: Clock,
         supervisor: Supervisor,
-        answers: Answers,
-        faults: Callable[[], tuple[Fault, ...]],
+        threads: ThreadWatch,
+        faults: PresentFaults,
         drivers: tuple[LidarStatus, AdcStatus | None],
     ) -> None:
-        self._clock, self._supervisor, self._answers, self._faults = clock, supervisor, answers, faults
+        self._clock, self._supervisor, self._threads, self._faults = clock, supervisor, threads, faults
         self._lidar, self._adc = drivers
         self._begun = clock.now()
         self._shown: tuple[int, tuple[Fault, ...], Condition] | None = None
 
     def __call__(self) -> Condition:
         """The condition of this moment."""
-        second, faults = int(self._clock.now() - self._begun), self._faults()
+        second, faults = int(self._clock.now() - self._begun), self._faults.faults
         shown = self._shown
         if shown is None or shown[0] != second or shown[1] is not faults:
             shown = self._shown = second, faults, self._made(second, faults)
@@ -68,5 +68,5 @@ class Reporter:
             faults=tuple(int(fault) for fault in faults),
             restarts=tuple(restarts[part] for part in Part),
             down=frozenset(NAMES.get(name, Part.OTHER) for name in self._supervisor.failed),
-            hanging=self._answers.hanging,
+            hanging=self._threads.hanging,
         )

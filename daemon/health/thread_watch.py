@@ -1,4 +1,4 @@
-"""Do the threads come back? Each says since when it has been at the one thing that it is doing.
+"""Hang detection: each worker thread reports the start time of its current job.
 
 What a restart cures (a computation that hangs) keeps the watchdog from being fed, what it does not cure is only said:
 a thread that hangs in the kernel, at a disk or a bus, hangs in the next process too, and ends this one's localisation.
@@ -34,7 +34,7 @@ class _Watched:
     limit_s: float
 
 
-class Answers:
+class ThreadWatch:
     """Watches threads; :meth:`look` once per heartbeat.
 
     Attributes:

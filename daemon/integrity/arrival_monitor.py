@@ -1,12 +1,12 @@
-"""When odometry readings arrived: whether they come, and as often as they used to."""
+"""Arrival monitor of odometry: whether readings arrive, and at their usual rate."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import Final
 
-SILENT_S: Final = 1.0
-"""Between two readings: what came before says nothing of now."""
+ODOMETRY_SILENT_S: Final = 1.0
+"""Odometry that has not arrived for this long is silent."""
 WINDOW_S: Final = 2.0
 ENOUGH: Final = 20
 """Readings that a rate is judged by."""
@@ -33,16 +33,17 @@ class Arrivals:
         """When the latest one arrived; None: none has."""
         return self._at[-1] if self._at else None
 
-    def take(self, t_rx: float) -> None:
+    def on_reading(self, t_rx: float) -> None:
         """A reading has arrived; what came before a silence says nothing of the rate now."""
-        if self._at and t_rx - self._at[-1] > SILENT_S:
+        if self._at and t_rx - self._at[-1] > ODOMETRY_SILENT_S:
             self._at.clear()
         self._at.append(t_rx)
 
     def seldom(self, t_mono: float, period: float) -> bool:
-        """Whether readings come more seldom than they used to, or than is asked for; asked for once a second.
+        """Whether readings come more seldom than they used to, or than is required; learns the usual rate on the way.
 
-        What is asked for goes by the lidar only where that is slow: wheels at 20 Hz are no fault with scans at 40 Hz.
+        The rate is learned once in half a window at most, however often this is called. The required rate goes by the
+        lidar only where that is slow: wheels at 20 Hz are no fault with scans at 40 Hz.
         """
         window = max(WINDOW_S, ENOUGH / self._usual_hz if self._usual_hz else 0.0)
         recent = sum(t_mono - t <= window for t in self._at)

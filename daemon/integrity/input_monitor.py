@@ -1,4 +1,4 @@
-"""What the data say of their devices beyond coming or not: too late, lost, and at odds with everything else.
+"""Input monitor: scans and readings that are late, lost, or inconsistent with the other sensors.
 
 Counters and facts for the vitals, fed by the cycle; nothing here changes what is done with the data.
 """
@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Final
 
 from daemon.health.reasons import Reason
-from daemon.integrity.arrival_monitor import SILENT_S
+from daemon.integrity.arrival_monitor import ODOMETRY_SILENT_S
 from daemon.integrity.state_memory import Memory
 from daemon.snapshot import State
 from hal.lidar import RawScan
@@ -56,7 +56,7 @@ class Watch:
 
     def on_odometry(self, reading: RawOdometry) -> None:
         """A reading has been taken; what was lost while none came at all is told as silence."""
-        if self._t_reading is not None and reading.t_rx - self._t_reading > SILENT_S:
+        if self._t_reading is not None and reading.t_rx - self._t_reading > ODOMETRY_SILENT_S:
             reading = replace(reading, missed=0)
         self.readings += 1
         self.missed += reading.missed

@@ -1,4 +1,4 @@
-"""What is wrong with lamps and survey, from the links of every epoch: said once, with the lamp's number.
+"""Lamp monitor: faults of lamps and survey from the links of every epoch; each is logged once, with the lamp's number.
 
 A lamp is judged by how long the same thing has been said of it. What has been found stays until that lamp is received
 as it should be, for the robot may not come by again for a while.
@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from daemon.health.faults import Fault
-from estimator.cdma.epoch import UNUSABLE, BlockFlag
-from estimator.result import Fix, LightsResult, Link, LinkState
+from estimator import UNUSABLE, BlockFlag, Fix, LightsResult, Link, LinkState
 
 log = logging.getLogger(__name__)
 

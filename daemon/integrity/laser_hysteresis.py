@@ -1,4 +1,4 @@
-"""Whether the laser is said to be left out: at once when it is, no longer only after it has been taken in for a while.
+"""Hysteresis for OVERLOADED: set when a cycle skips the laser, cleared after N consecutive cycles that used it.
 
 A computer that is nearly fast enough takes it in and leaves it out by turns; state, reason and log would flicker.
 """

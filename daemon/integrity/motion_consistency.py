@@ -1,4 +1,4 @@
-"""Do the wheels and the laser tell the same motion? A sliding window over the last seconds.
+"""Consistency of odometry and laser: compares their motion over a sliding window of the last seconds.
 
 The laser's witness is ``T_odom_base`` at scans whose match fixed every axis; the wheels' witness is the bare chain of
 odometry increments, which the laser never touches. Where a match did not fix an axis, the pose took that axis from the
@@ -12,8 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from estimator.measurements import Array, Odometry
-from estimator.numerics import se2
+from estimator import Array, Odometry, se2
 
 WINDOW_S: Final = 2.0
 """Long against stamp jitter, short against odometry drift."""
@@ -28,7 +27,7 @@ itself: on the recorded drive through the Intel Research Lab half of all windows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class MotionComparison:
     """The motion over some ``seconds`` as the ``laser`` and as the ``wheels`` tell it: T_then_now, (x, y, yaw)."""
 
     seconds: float
@@ -60,7 +59,7 @@ class _Seen:
     wheels: Array | None = None
 
 
-class Witnesses:
+class MotionConsistency:
     """Compares both motions; holds a few seconds of poses and nothing else."""
 
     def __init__(self) -> None:
@@ -93,10 +92,10 @@ class Witnesses:
 
     def agree(self) -> bool | None:
         """Whether both told the same motion over the window; None while that cannot be said."""
-        told = self.told()
+        told = self.compared()
         return None if told is None else told.agree
 
-    def told(self) -> Told | None:
+    def compared(self) -> MotionComparison | None:
         """What both told over the window; None while that cannot be said."""
         span = self._span()
         if span is None:
@@ -104,7 +103,7 @@ class Witnesses:
         old, new = span
         laser = se2.between(old.T_odom_base, new.T_odom_base)
         wheels = se2.between(self._wheels_at(old), self._wheels_at(new))
-        return Told(new.t_mono - old.t_mono, laser, wheels)
+        return MotionComparison(new.t_mono - old.t_mono, laser, wheels)
 
     def _span(self) -> tuple[_Seen, _Seen] | None:
         """Oldest and newest laser pose inside the window for which the wheels have spoken too."""

@@ -9,20 +9,32 @@ from typing import Final
 import numpy as np
 
 from daemon.health.reasons import Reason as Cause
+from daemon.integrity.arrival_monitor import ODOMETRY_SILENT_S
 from daemon.integrity.evidence import SILENT_PERIODS, VAGUE_M, VAGUE_RAD, Evidence, Light, Match
-from daemon.integrity.motion_consistency import Witnesses
-from estimator import result as light
-from estimator.measurements import Array, Command, LightEpoch, Odometry, Order, Record, SampleBlock
-from estimator.numerics import se2
-from estimator.result import SURPRISE, Fix, LoopReason, MatchResult, Reason, StepResult
+from daemon.integrity.motion_consistency import MotionConsistency
+from estimator import (
+    SURPRISE,
+    Array,
+    Command,
+    Fix,
+    LightEpoch,
+    LightsResult,
+    LoopReason,
+    MatchResult,
+    Odometry,
+    Order,
+    Reason,
+    Record,
+    SampleBlock,
+    StepResult,
+    se2,
+)
 from hal.lidar import LidarStatus, Link
 
 ENOUGH_INLIERS: Final = 0.4
 """Part of the beams that has to find its place in the map for a match to count as good."""
 OPENING_S: Final = 10.0
 """A lidar that has not delivered this long after the start is said to be unreachable, whatever its driver is doing."""
-ODOMETRY_SILENT_S: Final = 1.0
-"""Odometry that has not arrived for this long is silent."""
 LIGHT_SILENT_S: Final = 1.0
 """Samples that have not arrived for this long are missing; blocks come twenty times a second."""
 GUESS_S: Final = 0.5
@@ -44,7 +56,7 @@ class Observer:
 
     def __init__(self, t_mono: float, odometry: bool, lidar: bool = True, lights: bool = False) -> None:
         """Start watching; ``odometry``, ``lidar``, ``lights``: which inputs are configured."""
-        self.witnesses = Witnesses()
+        self.motion_consistency = MotionConsistency()
         self.unused: Cause | None = None
         self._lidar, self._lights = lidar, lights
         self._t_samples = t_mono
@@ -93,7 +105,7 @@ class Observer:
         """What one cycle adds; call it once per cycle with everything the cycle consumed."""
         for record in records:
             if isinstance(record, Odometry):
-                self.witnesses.on_odometry(record)
+                self.motion_consistency.on_odometry(record)
             elif isinstance(record, SampleBlock | LightEpoch):
                 self._t_samples = t_mono
         ordered = self._take_orders(records)
@@ -116,7 +128,7 @@ class Observer:
             sigma_m=sigma_m,
             sigma_rad=sigma_rad,
             odometry=self.odometry_ok(t_mono),
-            agree=self.witnesses.agree(),
+            agree=self.motion_consistency.agree(),
             guessed=any(self._guessed),
             places=_places(result),
             ordered=ordered,
@@ -138,7 +150,7 @@ class Observer:
         remembered = self._remembered
         if result is None or result.loop is None or result.loop.reason is not LoopReason.PLACED or remembered is None:
             return False
-        from estimator.relocalisation.hypothesis_tracking import near  # the estimator has been loaded, by the warm-up
+        from estimator import near  # the estimator has been loaded, by the warm-up
 
         self._remembered = None
         T_map_base = se2.compose(result.T_map_odom, result.T_odom_base)
@@ -188,7 +200,7 @@ class Observer:
         off_m, off_rad = math.hypot(*found.correction[:2].tolist()), abs(float(found.correction[2]))
         match = Match(good(found), _axes(result.known_axes), off_m, off_rad)
         laser = found.known_axes if result.placed else result.known_axes  # what light has shown is no echo of the laser
-        self.witnesses.on_match(result.t_mono, result.T_odom_base, match.good and all(_axes(laser)))
+        self.motion_consistency.on_match(result.t_mono, result.T_odom_base, match.good and all(_axes(laser)))
         return match
 
     def _without_guesses(self, match: Match, result: StepResult, t_mono: float, ordered: bool) -> Match:
@@ -247,7 +259,7 @@ def _lit(result: StepResult) -> bool:
     return agrees and result.lights is not None and result.lights.fix is Fix.GOOD
 
 
-def _nearly(lights: light.LightsResult) -> bool:
+def _nearly(lights: LightsResult) -> bool:
     """Whether light has a place that it is not sure of yet, by several lamps and no vaguer than a pose may be."""
     spread = float(lights.covariance[0, 0] + lights.covariance[1, 1])
     return lights.fix is Fix.STARTING and len(lights.accepted) >= SEVERAL and spread < 2.0 * VAGUE_M**2
@@ -258,7 +270,7 @@ def _axes(known: Array) -> tuple[bool, bool, bool]:
     return bool(x), bool(y), bool(yaw)
 
 
-def _contradicts(lights: light.LightsResult) -> bool:
+def _contradicts(lights: LightsResult) -> bool:
     """Whether of the lamps more are received that cannot be so at the place light is held to have told, than fit it."""
     fitting = len(lights.accepted) + sum(link.waiting for link in lights.links)
     return sum(link.against for link in lights.links) > fitting

@@ -1,4 +1,4 @@
-"""The alert: raised while the bound on the position error is above the limit that is set, or there is none."""
+"""The position alert: raised while the protection level exceeds the alert limit, or there is none."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Alarm:
         self._within_since: float | None = None
         self._expected = math.inf  # when the bound should be within the limit: `t_mono`, seconds
 
-    def take(self, t_mono: float, bound_m: float | None) -> bool:
+    def update(self, t_mono: float, bound_m: float | None) -> bool:
         """Take one cycle's bound (None: there is none) and say whether the alert is raised."""
         if self.limit_m <= 0.0:
             return False

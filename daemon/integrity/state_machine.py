@@ -1,4 +1,4 @@
-"""What is said about the pose: one pure state machine, fed once per cycle with evidence.
+"""The published state: one pure state machine, updated once per cycle with evidence.
 
 The rule it keeps: TRACKING is only said when two witnesses agree (light and laser about the place, wheel odometry and
 laser about the motion of the last seconds) or when one has proved itself (matches that are good, small and know every

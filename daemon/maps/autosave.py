@@ -20,15 +20,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.maps.container import BadMap
+from daemon.maps.generations import said
 from daemon.maps.start_trial import PROOF_S
-from daemon.maps.store import Start, Store, said
+from daemon.maps.store import Start, Store
+from daemon.system.callbacks import OnDone
 from daemon.system.versions import release
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 from hal.clock import Clock
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
-    from estimator.mapping.map_snapshot import MapImage
-    from estimator.state import State
+    from estimator import MapImage, State
 
 log = logging.getLogger(__name__)
 
@@ -52,8 +53,6 @@ FIXED: Final = "the map is used as it is: `map.localise` is true"
 ADRIFT: Final = "the place in the stored map is not known yet, and the map has not changed"
 
 Revision = tuple[int, int, int]
-Told = Callable[[str], None]
-"""Takes the end of a save that was asked for: :data:`DONE`, or why it came to nothing."""
 End = Callable[[Path | None, str], None]
 """Takes the end of a save in the loop's thread: the file, or None and why there is none."""
 
@@ -71,7 +70,7 @@ class About:
     localise: bool = False
 
 
-class Keeper:
+class MapAutosaver:
     """Keeps the map of a running estimator.
 
     Attributes:
@@ -100,7 +99,7 @@ class Keeper:
         self._proved_at, self._lasted = math.inf, False
         self._due = clock.now() + FIRST_S
         self._look_due = clock.now() + LOOK_S
-        self._waiting: list[Told] = []
+        self._waiting: list[OnDone] = []
         self._over = asyncio.Event()
         self._over.set()
 
@@ -141,12 +140,12 @@ class Keeper:
         if state is not None and self._start is not None:
             self._saved = self._revision(state)
 
-    def ask(self, told: Told) -> None:
+    def ask(self, on_done: OnDone) -> None:
         """Save as soon as possible, and say when it is on the disk, or why not."""
         if reason := self._against():
-            told(reason)
+            on_done(reason)
             return
-        self._waiting.append(told)
+        self._waiting.append(on_done)
         self._go_on()
 
     def _against(self) -> str:
@@ -173,7 +172,7 @@ class Keeper:
         self._proved_at, self._lasted = math.inf, True
         if self._store is not None:
             with contextlib.suppress(RuntimeError):  # no thread: the next start has one less to go
-                await beside(self._store.lasted, "map")
+                await run_in_thread(self._store.lasted, "map")
 
     async def finish(self, in_order: bool = True) -> None:
         """Save what has changed since the last time, wait for it, but not for ever.
@@ -185,7 +184,7 @@ class Keeper:
             async with asyncio.timeout(STOP_S):
                 if in_order and not self._lasted and self._store is not None:
                     with contextlib.suppress(RuntimeError):
-                        await beside(self._store.trial.ended, "map")
+                        await run_in_thread(self._store.trial.ended, "map")
                 await self._over.wait()
                 if in_order or self._lasted:
                     self._due, self._last = self._clock.now(), True
@@ -272,8 +271,7 @@ class Keeper:
         return self._map_id(), state.map.next_key, atlas.closures
 
     def _image(self, state: State) -> MapImage:
-        from estimator.mapping.map_snapshot import Identity
-        from estimator.stored_map import image_of
+        from estimator import Identity, image_of
 
         before = self._start.stored.meta if self._start is not None else None
         who = Identity(
@@ -306,7 +304,7 @@ class Keeper:
         meta = meta_of(image, self._clock.utc(), self._about.robot, release())
         return packed(image, meta, partial(time.sleep, BREATH_S))
 
-    def _end(self, revision: Revision, waiting: list[Told], path: Path | None, error: str) -> None:
+    def _end(self, revision: Revision, waiting: list[OnDone], path: Path | None, error: str) -> None:
         """Back in the loop's thread."""
         self._busy(False)
         self._due = self._clock.now() + (RETRY_S if error else EVERY_S)
@@ -322,8 +320,8 @@ class Keeper:
             again = "" if self._last else ", and it is tried again"
             log.info("the map cannot be saved: %s; what was saved before stays%s", error, again)  # the fault warns
         self.error = error
-        for told in waiting:
-            told(error)
+        for on_done in waiting:
+            on_done(error)
         if self._waiting:
             self._go_on()
 

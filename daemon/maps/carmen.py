@@ -13,8 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.measurements import Array, Beam, Beams
-from estimator.numerics import se2
+from estimator import Array, Beam, Beams, se2
 
 HEAD: Final = (
     "# message_name [message contents] ipc_timestamp ipc_hostname logger_timestamp\n"

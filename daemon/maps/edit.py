@@ -1,14 +1,11 @@
-"""``lumiloop map align`` and ``lumiloop map name``: a map file changed as a whole, written as the next generation.
+"""Changes of a map file as a whole: a rigid motion of its frame, or a name. Written as the next generation.
 
 Nothing here loads the estimator's compiler.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import secrets
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +15,12 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from daemon.cli import parser
 from daemon.config.paths import maps_folder
 from daemon.config.schema import Config
 from daemon.maps.container import BadMap, pack
+from daemon.maps.generations import said
 from daemon.maps.schema import Meta, Stored, Tables, read
-from daemon.maps.store import Store, said
+from daemon.maps.store import Store
 from daemon.system.atomic_file import write_whole
 
 Array = npt.NDArray[np.float64]
@@ -89,39 +86,6 @@ def keep(settings: Config, content: bytes, map_id: int) -> Path:
         store.close()
 
 
-def align(args: argparse.Namespace) -> int:
-    """Move a map so that points of it come to lie where a person says; returns the exit code."""
-    try:
-        stored = opened(args.map)
-        if stored.meta.surveyed:
-            raise Refused(f"{args.map}: lies in the frame of the lamps' survey; move the lamps in the survey instead")
-        fit = fitted([pair_of(text) for text in args.point])
-        judge(fit)
-        meta = msgspec.structs.replace(stored.meta, map_id=1 + secrets.randbelow(2**32 - 1))
-        path = written(args, moved(stored.tables, fit.T), meta)
-    except (BadMap, Refused, OSError) as error:
-        return parser.fail(str(error))
-    x, y, yaw = fit.T
-    off = ", ".join(f"{1e3 * one:.0f} mm" for one in fit.residual_m)
-    sys.stdout.write(
-        f"moved by x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(yaw):.2f} deg; points are off by {off}; "
-        f"distances are {100.0 * (fit.scale - 1.0):+.2f} % of the map's\n{path}: map {meta.map_id:08x}\n"
-    )
-    return parser.OK
-
-
-def name(args: argparse.Namespace) -> int:
-    """Say which floor or building a map is of; returns the exit code."""
-    try:
-        stored = opened(args.map)
-        meta = msgspec.structs.replace(stored.meta, name=called(args.text))
-        path = written(args, stored.tables, meta)
-    except (BadMap, Refused, OSError) as error:
-        return parser.fail(str(error))
-    sys.stdout.write(f"{path}: map {meta.map_id:08x} is called {meta.name!r}\n")
-    return parser.OK
-
-
 def called(text: str) -> str:
     """The name of a map.
 
@@ -134,17 +98,17 @@ def called(text: str) -> str:
     return text
 
 
-def written(args: argparse.Namespace, tables: Tables, meta: Meta) -> Path:
-    """Write the changed map: to ``args.out``, else as the next generation beside the old one."""
+def written(path: Path, out: Path | None, tables: Tables, meta: Meta) -> Path:
+    """Write the map of ``path``, changed: to ``out``, else as the next generation beside it; returns where it is."""
     content = pack({**tables, "meta": msgspec.structs.replace(meta, saved=time.time()).packed()})
     read(content)  # what cannot be read again is not written
-    if args.out is not None:
-        return put(args.out, content)
-    store = Store(args.map.parent)
+    if out is not None:
+        return put(out, content)
+    store = Store(path.parent)
     try:
         return store.save(content, meta.map_id)
     except OSError as error:
-        raise Refused(f"{args.map.parent}: {said(error)}; stop the daemon, or name --out FILE") from error
+        raise Refused(f"{path.parent}: {said(error)}; stop the daemon, or name --out FILE") from error
     finally:
         store.close()
 

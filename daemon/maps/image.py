@@ -11,12 +11,7 @@ import numpy.typing as npt
 
 from daemon.maps.container import AnyArray, Content, nothing, pack
 from daemon.maps.schema import Meta, Stored, Tables, lamp_tables, lamps_of
-from estimator.mapping.constraints import Constraints
-from estimator.mapping.keyframe import Keyframe, Settled, Submap
-from estimator.mapping.map_snapshot import Identity, MapImage, Piece, finished
-from estimator.measurements import Array
-from estimator.numerics import se2
-from estimator.result import Virtual
+from estimator import Array, Constraints, Identity, Keyframe, MapImage, Piece, Settled, Submap, Virtual, finished, se2
 
 SLICE: Final = 16
 """Keyframes or submaps handled before others are let in."""

@@ -135,7 +135,7 @@ class LastPose:
         self._thread = threading.Thread(target=self._work, name="lumiloop-pose", daemon=True)
         self._thread.start()
 
-    def take(self, snapshot: Snapshot) -> None:
+    def on_snapshot(self, snapshot: Snapshot) -> None:
         """Keep the pose of a snapshot if it is news; returns at once.
 
         A pose that this run has lost is forgotten. One that it has not found yet is left: it may be killed again.

@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.mapping.occupancy_grid import Grid
-from estimator.measurements import Array
+from estimator import Array, Grid
 
 Pixels = npt.NDArray[np.float64]
 

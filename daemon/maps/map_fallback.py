@@ -1,4 +1,4 @@
-"""Says in the log what becomes of a stored map in a frame of its own while light tells the robot's place.
+"""Fallback from a stored map in its own frame to a new one where light fixes the pose; logs each change.
 
 See `estimator.relocalisation.unaligned_map`: it is put aside, and found on the way or let go of.
 """
@@ -10,7 +10,7 @@ import struct
 import zlib
 from typing import Final
 
-from estimator.result import LoopReason, StepResult
+from estimator import LoopReason, StepResult
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from daemon.maps.container import AnyArray, BadMap, Damaged, unpack
-from estimator.light_filter.survey import Lamp, Survey
+from estimator import Lamp, Survey
 
 Tables = dict[str, AnyArray]
 Keys = npt.NDArray[np.int64]

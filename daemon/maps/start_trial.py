@@ -1,4 +1,4 @@
-"""A stored map with which every start comes to grief: after three in a row the generation before it has its turn.
+"""Guard against a stored map with which every start fails: after three failures the generation before it is used.
 
 Such a file is good by all that can be told from it, and meets a defect of the software. A service that is started again
 and again with it would never come up; without it the robot works. What counts are starts since the computer was
@@ -33,7 +33,7 @@ LEFT_OUT: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class StartAttempts:
     """What the file holds.
 
     Attributes:
@@ -47,7 +47,7 @@ class Told:
     out: tuple[str, ...] = ()
 
 
-class Trial:
+class StartTrial:
     """Counts starts, in a file. Where it cannot be written, none counts.
 
     Attributes:
@@ -56,7 +56,7 @@ class Trial:
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / NAME
-        self._told, self._begun = Told(), False
+        self._told, self._begun = StartAttempts(), False
         self.out: tuple[str, ...] = ()
 
     def read(self) -> None:
@@ -64,10 +64,10 @@ class Trial:
         boot = _boot()
         try:
             told = json.loads(self._path.read_text(encoding="ascii"))
-            before = Told(str(told["boot"]), str(told["of"]), int(told["count"]), tuple(map(str, told["out"])))
+            before = StartAttempts(str(told["boot"]), str(told["of"]), int(told["count"]), tuple(map(str, told["out"])))
         except (OSError, ValueError, KeyError, TypeError):
-            before = Told()
-        self._told = before if before.boot == boot else Told(boot)
+            before = StartAttempts()
+        self._told = before if before.boot == boot else StartAttempts(boot)
         self.out = self._told.out
 
     def changes(self, name: str) -> bool:
@@ -101,7 +101,7 @@ class Trial:
             self._path.unlink(missing_ok=True)
         return out
 
-    def _wrote(self, told: Told) -> bool:
+    def _wrote(self, told: StartAttempts) -> bool:
         try:
             write_whole(self._path, json.dumps(asdict(told)).encode())
         except OSError:

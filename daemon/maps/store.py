@@ -14,52 +14,31 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
 import logging
 import os
-import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from daemon.config.paths import maps_folder
-from daemon.config.schema import MapConfig
+from daemon.devices.light_setup import Lights
 from daemon.maps.container import BadMap, Damaged, Foreign
+from daemon.maps.generations import BROKEN, BROKEN_NAME, NAME, Generation, newest_number, said, verify
 from daemon.maps.schema import OtherBuilding, Stored, against_survey, read
-from daemon.maps.start_trial import LEFT_OUT, MOST, Trial
+from daemon.maps.start_trial import LEFT_OUT, MOST, StartTrial
 from daemon.system.atomic_file import sync_folder, write_whole
-
-if TYPE_CHECKING:
-    from daemon.runtime.light_setup import Lights
 
 log = logging.getLogger(__name__)
 
 LOCK: Final = "lock"
-NAME: Final = re.compile(r"map-([0-9a-f]{8})-([0-9]{8})\.lumimap")
-BROKEN: Final = ".broken"
-BROKEN_NAME: Final = re.compile(r"map-([0-9a-f]{8})-([0-9]{8})\.lumimap\.broken")
 MOST_BROKEN: Final = 8
 """Files that a failing disk has spoilt while they were saved, kept for who wants to know."""
 START: Final = "start.lumimap"
 """File of a recording's folder: the map that the run began with."""
 NEWEST: Final = 2
 OTHERS: Final = 7
-
-
-@dataclass(frozen=True, slots=True)
-class Generation:
-    """One file.
-
-    Attributes:
-        number: counts all saves in the folder; 0: somebody has put it there. map_id: by its name; negative: not told.
-    """
-
-    number: int
-    map_id: int
-    path: Path
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,10 +56,6 @@ class Start:
     localise: bool = False
 
 
-class NoMap(Exception):
-    """There is no map, and nothing can be done without one; names the folder and the remedy."""
-
-
 Judge = Callable[[Stored], tuple[str, frozenset[int]]]
 """Whether a map fits the configured survey: see `store_tables.against_survey`."""
 
@@ -93,47 +68,6 @@ def unjudged(stored: Stored) -> tuple[str, frozenset[int]]:
 def judge_for(lights: Lights | None) -> Judge:
     """Whether a map fits what is configured of lights."""
     return unjudged if lights is None else partial(against_survey, survey=lights.survey)
-
-
-def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tuple[Store | None, Start | None]:
-    """The folder of maps and the map that a run begins with, as far as there are such.
-
-    Raises:
-        NoMap: a map is to be used as it is, and there is none that can be.
-    """
-    if not config.kept:
-        return None, None
-    store = Store(maps_folder(config.folder), mend)
-    if mend and not config.localise:
-        store.claim()
-    start = store.load(judge_for(lights))
-    if start is None and config.localise:
-        raise NoMap(
-            f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make "
-            "one, or import one: lumiloop map import"
-        )
-    if start is None and store.refused:
-        log.error("no map in %s can be used; a new one is begun", store.folder)
-    if start is not None:
-        start = replace(start, localise=config.localise)
-        meta = start.stored.meta
-        named = f" ({meta.name})" if meta.name else ""
-        count = len(start.stored.tables["submap.key"])
-        log.info("map %08x%s of %d submaps loaded from %s", meta.map_id, named, count, store.folder)
-    return store, start
-
-
-def recorded_start(path: Path, sha256: str, lights: Lights | None, localise: bool = False) -> Start:
-    """The map in a recording's folder.
-
-    Raises:
-        OSError: it cannot be read. BadMap: it is not the one that the run began with, or not good.
-    """
-    content = path.read_bytes()
-    if hashlib.sha256(content).hexdigest() != sha256:
-        raise Damaged(f"{path.name} is not the map that the recorded run began with")
-    stored = read(content)
-    return Start(content, stored, judge_for(lights)(stored)[1], localise)
 
 
 class Store:
@@ -154,7 +88,7 @@ class Store:
         self._good: dict[Path, bool] = {}
         self._lock: int | None = None
         self.trouble = ""
-        self.trial: Final = Trial(folder)
+        self.trial: Final = StartTrial(folder)
 
     @property
     def refused(self) -> bool:
@@ -216,7 +150,7 @@ class Store:
             )
             self.damaged = True
             return None
-        by_map = sorted(generations, key=lambda one: (_newest(generations, one.map_id), one.number), reverse=True)
+        by_map = sorted(generations, key=lambda one: (newest_number(generations, one.map_id), one.number), reverse=True)
         looked = set[int]()
         for map_id, files in groupby(by_map, key=lambda one: one.map_id):
             looked.add(map_id)
@@ -424,28 +358,3 @@ class Store:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
-
-
-def verify(path: Path, content: bytes) -> None:
-    """Whether a file on the disk is what was written, and loads.
-
-    Raises:
-        Damaged: it is not. OSError: it cannot be read.
-    """
-    with path.open("rb") as file:
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # from the disk, not from what we just gave it
-        found = file.read()
-    if found != content:
-        raise Damaged("what was read back is not what was written: the disk is failing")
-    read(found)
-
-
-def said(error: OSError) -> str:
-    """What is wrong, for people."""
-    if isinstance(error, BlockingIOError):
-        return "another process keeps its maps there"
-    return error.strerror or str(error)
-
-
-def _newest(generations: list[Generation], map_id: int) -> int:
-    return max(one.number for one in generations if one.map_id == map_id)

@@ -16,17 +16,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from daemon.maps.autosave import ADRIFT, DONE, FIXED, NO_MAP, Keeper
+from daemon.maps.autosave import ADRIFT, DONE, FIXED, NO_MAP, MapAutosaver
 from daemon.maps.container import BadMap
-from daemon.maps.store import Judge, Start, Store, said
-from hal.blocking_calls import beside
+from daemon.maps.generations import said
+from daemon.maps.store import Judge, Start, Store
+from daemon.system.callbacks import OnDone
+from hal.blocking_calls import run_in_thread
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
-    from estimator.state import State
+    from estimator import State
 
 log = logging.getLogger(__name__)
 
-Told = Callable[[str], None]
 NOTHING_TO_SAVE: Final = (DONE, NO_MAP, FIXED, ADRIFT)
 
 BUSY: Final = "another map is just being loaded"
@@ -58,8 +59,7 @@ def take_over(state: State, donor: State) -> None:
 
     Answers to what was asked about the old map will mean nothing: job numbers go on counting.
     """
-    from estimator.numerics import se2
-    from estimator.relocalisation.map_reset import forget_map
+    from estimator import forget_map, se2
 
     forget_map(state)
     donor.map.graph.jobs, donor.map.graph.closures = state.jobs, state.map.graph.closures
@@ -95,43 +95,45 @@ class MapSwitch:
     """Carries out one switch after the other.
 
     Args:
-        keeper: saves the map in use.
+        autosaver: saves the map in use.
         put: hands a switch to the cycle; its second argument is called once the cycle has taken it. None takes back
             what has been handed over and not been taken.
     """
 
-    def __init__(self, maps: Maps, keeper: Keeper, put: Callable[[Switch | None, Callable[[], None]], None]) -> None:
-        self._maps, self._keeper, self._put = maps, keeper, put
+    def __init__(
+        self, maps: Maps, autosaver: MapAutosaver, put: Callable[[Switch | None, Callable[[], None]], None]
+    ) -> None:
+        self._maps, self._autosaver, self._put = maps, autosaver, put
         self._task: asyncio.Task[None] | None = None
 
-    def ask(self, map_id: int, told: Told, patient: bool = False) -> None:
-        """Go on in a stored map; ``told``: empty, or why that came to nothing.
+    def ask(self, map_id: int, on_done: OnDone, patient: bool = False) -> None:
+        """Go on in a stored map; ``on_done``: empty, or why that came to nothing.
 
         ``patient``: wait for a cycle that takes it for as long as it may be; nobody waits for an answer.
         """
         if self._task is not None and not self._task.done():
-            told(BUSY)
+            on_done(BUSY)
             return
-        self._task = asyncio.get_running_loop().create_task(self._switch(map_id, told, patient), name="map switch")
+        self._task = asyncio.get_running_loop().create_task(self._switch(map_id, on_done, patient), name="map switch")
 
-    async def _switch(self, map_id: int, told: Told, patient: bool) -> None:
+    async def _switch(self, map_id: int, on_done: OnDone, patient: bool) -> None:
         try:
             reason = await self._carried_out(map_id, patient)
         except Exception as error:  # a defect must not leave the client waiting, and is told in full
             log.exception("the map cannot be switched")
             reason = repr(error)
-        told(reason)
+        on_done(reason)
 
     async def _carried_out(self, map_id: int, patient: bool) -> str:
         store = self._maps.store
         if store is None:
             return NO_FOLDER
-        if not self._keeper.ready:
+        if not self._autosaver.ready:
             return NOT_LOADED
-        if map_id == self._keeper.map_id:
+        if map_id == self._autosaver.map_id:
             return IN_USE
         try:
-            there = {one.map_id for one in await beside(store.generations, "switch") if one.map_id >= 0}
+            there = {one.map_id for one in await run_in_thread(store.generations, "switch") if one.map_id >= 0}
         except OSError as error:
             return f"{store.folder}: {said(error)}"
         if map_id not in there:
@@ -140,7 +142,7 @@ class MapSwitch:
         if (reason := await self._saved()) not in NOTHING_TO_SAVE:
             return f"the map in use cannot be saved: {reason}"
         try:
-            switch = await beside(partial(self._load, store, map_id), "switch")
+            switch = await run_in_thread(partial(self._load, store, map_id), "switch")
         except (BadMap, OSError) as error:
             return f"map {map_id:08x} cannot be used: {said(error) if isinstance(error, OSError) else error}"
         taken = asyncio.Event()
@@ -158,7 +160,7 @@ class MapSwitch:
     async def _saved(self) -> str:
         """The end of a save of the map in use."""
         ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._keeper.ask(lambda reason: None if ended.done() else ended.set_result(reason))
+        self._autosaver.ask(lambda reason: None if ended.done() else ended.set_result(reason))
         return await ended
 
     def _load(self, store: Store, map_id: int) -> Switch:

@@ -19,10 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
     from asyncio import AbstractEventLoop
 
-    from estimator.mapping.grid_patches import Cells, Tile
-    from estimator.mapping.keyframe import Keyframe, Submap
-    from estimator.mapping.live_grid import LiveGrid, Progress, Task
-    from estimator.state import State
+    from estimator import Cells, Keyframe, LiveGrid, Progress, State, Submap, Task, Tile
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +98,7 @@ class MapTiles:
 
     def _look(self, state: State) -> None:
         """Take in the keyframes that have come, and let go of submaps that have gone."""
-        from estimator.mapping.live_grid import LiveGrid
+        from estimator import LiveGrid
 
         live = self._live
         if live is None:
@@ -133,7 +130,7 @@ class MapTiles:
             self._frames.pop(key, None)
 
     def _hand_out(self, task: Task, adrift: float, left: int, loop: AbstractEventLoop) -> None:
-        from estimator.mapping.live_grid import advance
+        from estimator import advance
 
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, "lumiloop-tiles", _step_back)

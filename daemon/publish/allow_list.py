@@ -1,4 +1,4 @@
-"""Who is answered: the addresses in `allow`, and always this computer itself.
+"""Allow-list for remote clients; loopback is always allowed.
 
 What comes from anywhere else is as good as not sent: a datagram is dropped, a connection is closed. This is no
 protection against one who can forge addresses on the network; it keeps the wrong machines out, not an attacker.

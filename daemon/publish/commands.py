@@ -1,4 +1,4 @@
-"""Orders that come in over Modbus: each goes to who carries it out, and its end back to the client.
+"""Commands from Modbus: dispatches each to its handler and returns its outcome to the client.
 
 A controller may repeat an order at any rate (it writes a new number in every turn of its program): the log then gets
 some of them and their count.
@@ -10,23 +10,20 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from daemon.publish.feeds import Feeds
 from daemon.publish.modbus.holding import CommandCode, Outcome, Request
 from daemon.snapshot import Snapshot
+from daemon.system.callbacks import OnDone
 from daemon.system.logging import Sparing
-from estimator.measurements import Command, Order
+from estimator import Command, Order
 from hal.clock import Clock
-
-if TYPE_CHECKING:
-    from daemon.publish.network import Feeds
 
 log = logging.getLogger(__name__)
 
-Told = Callable[[str], None]
-"""Told the end of something: empty, or why it came to nothing."""
 
 NO_RECORDER: Final = "this run keeps no flight recorder: start it with --record DIR --last MINUTES"
 NO_MAPS: Final = "this run stores no maps: set map.folder"
@@ -56,24 +53,24 @@ class Orders:
         self._asked: list[_Asked] = []
         self._lines = Sparing(log)
 
-    def take(self, request: Request) -> None:
+    def handle(self, request: Request) -> None:
         """An order as it was written; whatever goes wrong with it, the client hears of its end."""
         self._lines.say(self._clock.now(), logging.INFO, f"Modbus: {_said(request)}")
-        told = partial(self._ended, request)
+        on_done = partial(self._ended, request)
         try:
-            self._hand_on(request, told)
+            self._hand_on(request, on_done)
         except Exception as failure:
             log.debug("%s has failed", request.code.name, exc_info=True)  # at any rate: above, it would fill the log
-            told(f"it has failed: {failure!r}")
+            on_done(f"it has failed: {failure!r}")
 
-    def _hand_on(self, request: Request, told: Told) -> None:
+    def _hand_on(self, request: Request, on_done: OnDone) -> None:
         feeds, code = self._feeds, request.code
         if code is CommandCode.SAVE_MAP:
-            feeds.on_save(told)
+            feeds.on_save(on_done)
         elif code is CommandCode.DUMP_RECORDER:
-            told(NO_RECORDER) if feeds.on_dump is None else feeds.on_dump(told)
+            on_done(NO_RECORDER) if feeds.on_dump is None else feeds.on_dump(on_done)
         elif code is CommandCode.SWITCH_MAP:
-            told(NO_MAPS) if feeds.on_switch is None else feeds.on_switch(request.map_id, told)
+            on_done(NO_MAPS) if feeds.on_switch is None else feeds.on_switch(request.map_id, on_done)
         else:
             self._to_cycle(request)
 

@@ -13,19 +13,20 @@ from daemon.publish.document_tables import NOT_KNOWN, NOTICE, bit_rows, holding_
 from daemon.publish.document_udp import udp_page
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.modbus import (
+    counts,
     holding,
     integrity_block,
     lights_block,
     parts_block,
     registers,
     requests,
-    server,
+    tcp_endpoint,
     timing_block,
 )
 from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.holding import CommandCode
 from daemon.publish.modbus.rtu import PATIENCE_S, SILENCE_S
-from daemon.snapshot import LightFix, LinkUse, LoopReason, State
+from daemon.snapshot import LISTED_LINKS, LightFix, LinkUse, LoopReason, State
 
 
 def _state_rows() -> list[tuple[str, ...]]:
@@ -165,7 +166,7 @@ def _lights() -> str:
     head = [row for row in every if not row[1].startswith("`link_")]
     one = [row for row in every if row[1].startswith("`link_1_")]
     start, width = block.body + block.offsets[len(head)], lights_block.ROW_WORDS
-    words, links = block.registers, lights_block.ROWS
+    words, links = block.registers, LISTED_LINKS
     return f"""## Lights: input registers {first} to {last}
 
 The lamps in view, strongest first, and the position from lights alone, which the laser never touches. Read
@@ -275,11 +276,11 @@ def _limits() -> str:
         ("address outside the tables", "", "exception 2"),
         ("any other function", "", "exception 1"),
         ("an error of the daemon's own, which its log tells", "", "exception 4"),
-        ("TCP connections", str(server.MAX_CONNECTIONS),
-         f"the longest idle is dropped if idle for {server.EVICT_S:g} s, else the new one"),
-        ("TCP without a request", f"{server.IDLE_S:g} s", "closed"),
-        ("TCP request not completed", f"{server.PARTIAL_S:g} s", "closed"),
-        ("TCP answers not read", f"{server.STUCK_S:g} s", "closed"),
+        ("TCP connections", str(counts.MAX_CONNECTIONS),
+         f"the longest idle is dropped if idle for {tcp_endpoint.EVICT_S:g} s, else the new one"),
+        ("TCP without a request", f"{tcp_endpoint.IDLE_S:g} s", "closed"),
+        ("TCP request not completed", f"{tcp_endpoint.PARTIAL_S:g} s", "closed"),
+        ("TCP answers not read", f"{tcp_endpoint.STUCK_S:g} s", "closed"),
         ("what is not Modbus", "", "UDP: ignored; TCP: closed; the log names who sends it, once a minute"),
     ]  # fmt: skip
     return table(("what", "limit", "beyond it"), rows)

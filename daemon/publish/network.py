@@ -9,53 +9,30 @@ import asyncio
 import logging
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.config.endpoints import ANYBODY, interface_of, parse_endpoint, subscription_port
 from daemon.config.schema import Config, ModbusConfig
 from daemon.health.reasons import REASONS, Reason
+from daemon.integrity.arrival_monitor import ODOMETRY_SILENT_S
 from daemon.publish.allow_list import Access
-from daemon.runtime.cycle import Sink
-from estimator.measurements import Command
+from daemon.publish.feeds import Feeds, OnOdometry
+from daemon.runtime.cycle_parts import Sink
 from hal.clock import Clock
-from hal.imu import RawImu
 from hal.odometry import RawOdometry
 
 if TYPE_CHECKING:
-    from daemon.publish.commands import Told
     from daemon.publish.modbus.server import ModbusPublisher
-    from daemon.publish.stream_server import StreamServer
+    from daemon.publish.stream.server import StreamServer
     from daemon.publish.udp_sender import PoseSender
 
 log = logging.getLogger(__name__)
 
-SILENT_S: Final = 1.0
-"""Another sender of odometry is listened to once the present one has been silent for this long."""
 CALM_S: Final = 60.0
 """That one is ignored is said again when it has not happened for so long."""
 
 Run = Callable[[], Awaitable[None]]
-OnOdometry = Callable[[RawOdometry], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Feeds:
-    """Who takes what comes in.
-
-    ``on_save`` is asked to save the map, ``on_dump`` to write the flight recorder, ``on_switch`` to go on in another
-    map; each tells the end of it: empty, or why it came to nothing. What is None is refused. ``on_loop_seen``: how many
-    loops a client has seen.
-    """
-
-    on_odometry: OnOdometry
-    on_imu: Callable[[RawImu], None]
-    on_command: Callable[[Command], None]
-    on_save: Callable[[Told], None]
-    on_dump: Callable[[Told], None] | None = None
-    on_switch: Callable[[int, Told], None] | None = None
-    on_loop_seen: Callable[[int], None] = lambda _: None
 
 
 class OneSender:
@@ -68,9 +45,9 @@ class OneSender:
         self._sender = ""
         self._heard = 0.0
 
-    def take(self, sender: str, reading: RawOdometry) -> None:
+    def receive(self, sender: str, reading: RawOdometry) -> None:
         """Pass a reading on if its sender has the floor."""
-        if sender != self._sender and self._sender and reading.t_rx - self._heard <= SILENT_S:
+        if sender != self._sender and self._sender and reading.t_rx - self._heard <= ODOMETRY_SILENT_S:
             self.refused += 1
             if reading.t_rx - self._refused_at > CALM_S:
                 log.warning("odometry from %s is ignored while %s sends it too", sender, self._sender)
@@ -120,7 +97,7 @@ class Network:
             self._clock,
             write=settings.write,
             allowed=self._access,
-            on_command=lambda request: orders.take(request),
+            on_command=lambda request: orders.handle(request),
             on_odometry=self._from("Modbus"),
             on_loop_seen=self._feeds.on_loop_seen,
         )
@@ -148,7 +125,7 @@ class Network:
         self.parts["pose"] = lambda: _open(sender.start, sender.close)
 
     def _add_stream(self, path: Path) -> None:
-        from daemon.publish.stream_server import StreamServer
+        from daemon.publish.stream.server import StreamServer
 
         server = StreamServer(path, self._settings.name, lambda reason: REASONS[Reason(reason)])
         self.stream = server
@@ -165,7 +142,7 @@ class Network:
 
     def _from(self, sender: str) -> OnOdometry:
         """A callback for one sender's readings."""
-        return lambda reading: self._odometry.take(sender, reading)
+        return lambda reading: self._odometry.receive(sender, reading)
 
 
 async def _open(start: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]) -> None:

@@ -1,4 +1,4 @@
-"""Who on this computer answers at a port, and whether that is the daemon that was meant.
+"""The process of this computer that owns a port, and whether it is the intended daemon.
 
 Modbus does not say whose registers it shows. The kernel knows: who has the socket, and who listens at the local stream.
 Standard library only, as the command that asks.

@@ -25,7 +25,7 @@ from typing import Any, Final
 from daemon.system.logging import Sparing
 from hal.net import inet
 from hal.net.fair_share import Reader, Share
-from hal.net.reply_address import ASKED_SPACE, Source, asked_at, send_from, tell_asked
+from hal.net.reply_address import PACKET_INFO_SPACE, ReplySource, enable_packet_info, reply_source, send_from
 
 MAGIC: Final = b"LUSB"
 VERSION: Final = 1
@@ -171,7 +171,7 @@ class Subscriptions:
         except OSError as error:
             device = f"pose subscriptions on {self._bind}:{self._wanted}"
             raise inet.refusal(device, "pose.receivers", self._wanted, error) from error
-        self._space = ASKED_SPACE if tell_asked(self._sock) else 0
+        self._space = PACKET_INFO_SPACE if enable_packet_info(self._sock) else 0
         self._reader = Reader(self._sock.fileno(), partial(self._serve, self._sock), Share())
 
     async def close(self) -> None:
@@ -189,7 +189,7 @@ class Subscriptions:
         for peer, source in self.leases.peers(asyncio.get_running_loop().time()):
             self._send(self._sock, data, peer, source)
 
-    def _send(self, sock: socket.socket, data: bytes, peer: Any, source: Source) -> None:
+    def _send(self, sock: socket.socket, data: bytes, peer: Any, source: ReplySource) -> None:
         try:
             send_from(sock, data, source, peer)
         except OSError:
@@ -211,7 +211,7 @@ class Subscriptions:
             except ValueError:
                 self.malformed += 1
                 continue
-            before, source = len(self.leases), asked_at(told)
+            before, source = len(self.leases), reply_source(told)
             if (answer := self.leases.answer((peer, source), message, now)) is not None:
                 self._send(sock, encode(answer), peer, source)
             if (count := len(self.leases)) != before:

@@ -34,14 +34,18 @@ from daemon.recording.restore import (
     piece_of,
     weak_set,
 )
-from estimator.light_filter.residual_map import ResidualMap
-from estimator.light_filter.survey import Survey
-from estimator.mapping.keyframe import Keyframe, Settled, Submap
-from estimator.mapping.map_state import MapState
-from estimator.mapping.submap_graph import SubmapGraph
-from estimator.relocalisation.hypothesis_tracking import SearchedAside
-from estimator.scan_matching.match_memory import MatchMemory
-from estimator.state import State
+from estimator import (
+    Keyframe,
+    MapState,
+    MatchMemory,
+    ResidualMap,
+    SearchedAside,
+    Settled,
+    State,
+    Submap,
+    SubmapGraph,
+    Survey,
+)
 
 PROTOCOL: Final = 5
 
@@ -146,7 +150,7 @@ def _fields_of(piece: object) -> dict[str, Any]:
     return {name: getattr(piece, name) for name in field_names(kind)}
 
 
-def take(state: State, rest: dict[str, object]) -> Taken:
+def capture(state: State, rest: dict[str, object]) -> Taken:
     """Take the estimator's state and the ``rest``, which may refer to the same things.
 
     It takes longer the more submaps and keyframes there are; docs/replay.md has figures.

@@ -1,7 +1,7 @@
 """The flight recorder: when a recording gets a state to be replayed from, and when a dump of it is made.
 
-All of it runs in the loop's thread, at the end of a cycle: it takes what is there (`daemon.recording.checkpoint.take`)
-and hands it to the threads that write.
+All of it runs in the loop's thread, at the end of a cycle: it captures the state
+(`daemon.recording.checkpoint.capture`) and hands it to the threads that write.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from typing import TYPE_CHECKING, Any, Final
 from daemon.health.faults import FAULTS, Fault
 from daemon.recording.disk_writer import CLOCK, SEGMENT_BYTES, SegmentWriter, both
 from daemon.recording.replay_start import CYCLE_PARTS
-from daemon.recording.retention import ASKED, Begun, Flight, Told
-from daemon.runtime.cycle import Cycle, CycleRecord
-from estimator.measurements import Job
+from daemon.recording.retention import ASKED, Begun, Flight
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import CycleRecord
+from daemon.system.callbacks import OnDone
+from estimator import Job
 from hal.clock import Clock
 from hal.replay.recording import Kind, pack_frame
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
     from daemon.recording.checkpoint import Taken
-    from estimator.state import State
+    from estimator import State
 
 log = logging.getLogger(__name__)
 
@@ -177,22 +179,22 @@ class BlackBox:
             else:
                 self._due = now + self._every_s
 
-    def dump(self, told: Told) -> None:
-        """Make a dump of what there is, now; ``told`` in this thread when it is there, or why not.
+    def dump(self, on_done: OnDone) -> None:
+        """Make a dump of what there is, now; ``on_done`` in this thread when it is there, or why not.
 
         One at a time, each holds a state until the disk has it; and another only after :data:`ASKED_AGAIN_S`.
         """
         now, loop = self._clock.now(), asyncio.get_running_loop()
         if self._asked:
-            told(UNDER_WAY)
+            on_done(UNDER_WAY)
             return
         if now < self._ask_from:
-            told(f"one was made a moment ago; another can be made in {self._ask_from - now:.0f} s")
+            on_done(f"one was made a moment ago; another can be made in {self._ask_from - now:.0f} s")
             return
 
         def end(reason: str) -> None:
             self._asked = False
-            told(reason)
+            on_done(reason)
 
         def back(reason: str) -> None:
             with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
@@ -278,11 +280,11 @@ class BlackBox:
             "samples": None if samples is None else dict(vars(samples)),
             "blocks": None if blocks is None else {**vars(blocks), "status": None},
         }
-        from daemon.recording.checkpoint import CannotTake, take
+        from daemon.recording.checkpoint import CannotTake, capture
 
         begun = time.perf_counter()
         try:
-            taken = take(state, rest)
+            taken = capture(state, rest)
         except CannotTake as error:
             if not self.error:
                 log.error("flight recorder: %s; what is recorded replays from an older state", error)
@@ -304,14 +306,14 @@ class BlackBox:
             "faults": [int(fault) for fault in sorted(self._present)],
         }
 
-    def _dump(self, reason: str, why: str, told: Told) -> None:
+    def _dump(self, reason: str, why: str, on_done: OnDone) -> None:
         about = self._about(reason, why)
 
         def then(segment: int | None) -> None:
             if segment is None:
-                told("nothing can be written at the moment")
+                on_done("nothing can be written at the moment")
             else:
-                self.flight.dump(about, told)
+                self.flight.dump(about, on_done)
 
         self._begin(then)
 

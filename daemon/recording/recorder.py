@@ -20,17 +20,16 @@ import msgspec
 import numpy as np
 
 from daemon.config.schema import Config
+from daemon.devices.light_setup import RESIDUALS, Lights
 from daemon.devices.port_tap import tapped
 from daemon.maps.store import START, Start
 from daemon.recording.disk_writer import SegmentWriter, both
 from daemon.recording.flight_recorder import BlackBox
-from daemon.runtime.cycle import CycleRecord
-from daemon.runtime.light_setup import RESIDUALS, Lights
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.snapshot import Snapshot
 from daemon.system.atomic_file import write_whole
 from daemon.system.versions import versions
-from estimator.measurements import UNLIMITED, Array, Command, Limits, Order
-from estimator.result import StepResult
+from estimator import UNLIMITED, Array, Command, Limits, Order, StepResult
 from hal.adc import RawSamples
 from hal.clock import Clock
 from hal.imu import RawImu
@@ -61,14 +60,14 @@ class CommandEntry(msgspec.Struct, frozen=True, array_like=True):
 
 
 class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
-    """A cycle as it is recorded; see `daemon.runtime.cycle.CycleRecord`. Fields are only ever added at the end.
+    """A cycle as it is recorded; see `daemon.runtime.cycle_parts.CycleRecord`. Fields are only ever added at the end.
 
     Attributes:
         limits: (ICP iterations, points, whether the map may be updated), None where nothing was stepped.
         odom, map_odom: T_odom_base and T_map_odom after the cycle, None before the first step.
         codes: `Limits.codes`, None where nothing was stepped or before there were lights.
         samples: blocks received by then. light: pose of the `lights` filter after the cycle, None where it has none.
-        rung: `Limits.rung`. switched: `CycleRecord.switched`; the map is in a file of its own, see :func:`switch_name`.
+        rung: `Limits.level`. switched: `CycleRecord.switched`; the map is in a file of its own (:func:`switch_name`).
         reason: published with the state, None in recordings of before it was kept; they know of no ``faults`` either.
         faults: numbers of all that were published, gravest first. In every cycle, for a recording may begin with any.
         waiting: `CycleRecord.waiting`, all that state and reason take from a driver.
@@ -138,7 +137,7 @@ def _entry(record: CycleRecord) -> CycleEntry:
         codes=None if limits is None else limits.codes,
         samples=record.samples,
         light=light_of(result),
-        rung=0 if limits is None else limits.rung,
+        rung=0 if limits is None else limits.level,
         switched=record.switched,
         reason=record.snapshot.reason,
         faults=_faults(record.snapshot),
@@ -216,7 +215,7 @@ class Recorder:
         self.box.close(ended)
 
     def on_cycle(self, record: CycleRecord) -> None:
-        """Keep a cycle's decisions (`daemon.runtime.cycle.Tap`)."""
+        """Keep a cycle's decisions (`daemon.runtime.cycle_parts.Tap`)."""
         self.disk.put(Kind.CYCLE, 0, record.t_mono, _encode(_entry(record)))
         self.box.on_cycle(record)
 

@@ -1,4 +1,4 @@
-"""The moment at which the replay of a recording begins that has no beginning, or none that is wanted."""
+"""Start of a replay within a recording: the stored state that it begins from."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from hal.replay.text import unreadable
 if TYPE_CHECKING:  # loads the estimator
     from daemon.recording.restore import Piece
     from daemon.runtime.cycle import Cycle
-    from estimator.measurements import Job
-    from estimator.state import State
+    from estimator import Job, State
 
 
 CYCLE_PARTS: Final = (
-    "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_painter", "blocks", "lamps",
+    "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_builder", "blocks", "lamps",
     "alarm", "trust", "inbox", "paused", "watch", "_left_out",
 )  # fmt: skip
 """What a cycle remembers."""

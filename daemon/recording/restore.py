@@ -24,11 +24,7 @@ from weakref import WeakSet
 import msgspec
 import numpy as np
 
-from estimator.light_filter.residual_map import ResidualMap
-from estimator.light_filter.survey import Survey
-from estimator.mapping.grid_patches import Patch
-from estimator.mapping.keyframe import Keyframe, Settled, Submap
-from estimator.state import State
+from estimator import Keyframe, Patch, ResidualMap, Settled, State, Submap, Survey
 
 WHOLE: Final = (Survey, ResidualMap, np.ndarray)
 """Pieces that refer to nothing else."""

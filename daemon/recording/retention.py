@@ -1,4 +1,4 @@
-"""What becomes of a recording's segments: states beside them, the oldest taken away, dumps. In a thread of its own.
+"""Retention of a recording's segments: states beside them, removal of the oldest, dumps. Runs in its own thread.
 
 A recording can be replayed from its beginning, and from every segment with a state beside it. What is taken away is
 therefore everything before such a segment, and never the last of them. A dump is a folder of links to the segments that
@@ -26,9 +26,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from daemon.devices.light_setup import RESIDUALS
 from daemon.maps.store import START
-from daemon.runtime.light_setup import RESIDUALS
 from daemon.system.atomic_file import sync_folder, write_whole
+from daemon.system.callbacks import OnDone
 from hal.replay.recording import STATE_SUFFIX, SUFFIX, segment_name, state_name
 
 if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
@@ -64,8 +65,6 @@ RESERVE_BYTES: Final = 512 << 20
 BREATH_S: Final = 0.0005
 """Pause between two slices of pickling."""
 CLOSE_S: Final = 5.0
-
-Told = Callable[[str], None]
 
 
 class Begun(NamedTuple):
@@ -133,9 +132,9 @@ class Flight:
         """A segment was begun; its state is to be written."""
         self._tasks.put(partial(self._keep, begun))
 
-    def dump(self, about: dict[str, Any], told: Told) -> None:
-        """Link what there is; ``told``: empty, or why that came to nothing. Called in this thread of its own."""
-        self._tasks.put(partial(self._dump, about, told))
+    def dump(self, about: dict[str, Any], on_done: OnDone) -> None:
+        """Link what there is; ``on_done``: empty, or why that came to nothing. Called in this thread of its own."""
+        self._tasks.put(partial(self._dump, about, on_done))
 
     def close(self, ended: bool) -> None:
         """Finish what was asked for, for so long. ``ended``: as it should; else the next start keeps it as a dump.
@@ -260,13 +259,13 @@ class Flight:
                 if path.stat().st_mtime < ended - SWITCH_S:
                     path.unlink()
 
-    def _dump(self, about: dict[str, Any], told: Told) -> None:
+    def _dump(self, about: dict[str, Any], on_done: OnDone) -> None:
         reason = "a defect, see the log"
         try:
             reason = self._dumped(about)
         finally:  # whoever has asked hears of it, whatever has happened
             self._owed = bool(reason)
-            told(reason)
+            on_done(reason)
 
     def _dumped(self, about: dict[str, Any]) -> str:
         """Make a dump; empty, or why there is none."""

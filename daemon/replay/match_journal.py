@@ -18,14 +18,23 @@ import numpy as np
 from daemon.replay import match_plot
 from daemon.replay.results import OutputRefused
 from daemon.system.extras import how_to_install
-from estimator.match_entry import Entry, LightSaid, entry_of
-from estimator.measurements import Array, Scan
-from estimator.result import MatchResult, Reason
-from estimator.scan_matching import icp, match_trace, scan_matcher
-from estimator.scan_matching.deskew import ScanPoints
-from estimator.scan_matching.match_trace import Pairs, Told
-from estimator.scan_matching.scan_matcher import Asked
-from estimator.state import State
+from estimator import (
+    Array,
+    Asked,
+    Entry,
+    LightSaid,
+    MatchResult,
+    Pairs,
+    Reason,
+    Scan,
+    ScanPoints,
+    State,
+    Told,
+    entry_of,
+    icp,
+    match_trace,
+    scan_matcher,
+)
 
 FORMAT: Final = "lumiloop-match"
 VERSION: Final = 1

@@ -8,12 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator.match_entry import Entry, LightSaid
-from estimator.measurements import Array
-from estimator.numerics import se2
-from estimator.result import Reason
-from estimator.scan_matching import icp, local_map
-from estimator.scan_matching.match_trace import Iteration, Told
+from estimator import Array, Entry, Iteration, LightSaid, Reason, Told, icp, local_map, se2
 
 _INCHES: Final = (14.0, 10.5)
 _MARGIN_M: Final = 0.5

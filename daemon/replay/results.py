@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -15,20 +15,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from daemon.maps import map_drawing
-from daemon.maps.map_server import FREE, OCCUPIED
-from daemon.maps.png import encode_png
 from daemon.snapshot import GUESSED, State
-from estimator.mapping.occupancy_grid import Grid
-from estimator.measurements import Array
-
-RESOLUTIONS_M: Final = (0.05, 0.1, 0.2, 0.5, 1.0)
-"""Metres per cell of an exported map."""
+from estimator import Array
 
 _PROBE: Final = ".lumiloop-probe"
-_UNKNOWN_GREY: Final = 205
-_FREE_GREY: Final = 254
-_WALL_GREY: Final = 0
 _TUM_HEAD: Final = "# timestamp x y z qx qy qz qw\n"
 
 
@@ -172,55 +162,3 @@ def kitti(trajectory: Trajectory) -> bytes:
     return "".join(
         f"{c:.9f} {-s + 0.0:.9f} 0 {x:.6f} {s:.9f} {c:.9f} 0 {y:.6f} 0 0 1 0\n" for c, s, x, y in rows
     ).encode()
-
-
-def finest(draw: Callable[[float], Grid]) -> Grid:
-    """The map at the finest of :data:`RESOLUTIONS_M` that its extent allows: ``draw`` raises `ValueError` beyond."""
-    for resolution in RESOLUTIONS_M[:-1]:
-        try:
-            return draw(resolution)
-        except ValueError:
-            continue
-    return draw(RESOLUTIONS_M[-1])
-
-
-def greys(grid: Grid) -> npt.NDArray[np.uint8]:
-    """Trinary pixels of a map, top row (largest y) first: 0 occupied, 254 free, 205 unknown."""
-    probability = grid.probability[::-1]
-    pixels = np.full(probability.shape, _UNKNOWN_GREY, np.uint8)
-    pixels[probability > OCCUPIED] = _WALL_GREY
-    pixels[probability < FREE] = _FREE_GREY
-    return pixels
-
-
-def pgm(grid: Grid) -> bytes:
-    """Binary PGM of a map as map_server reads it; an empty map is one unknown cell."""
-    pixels = greys(grid)
-    if pixels.size == 0:
-        pixels = np.full((1, 1), _UNKNOWN_GREY, np.uint8)
-    rows, columns = pixels.shape
-    return f"P5\n{columns} {rows}\n255\n".encode() + pixels.tobytes()
-
-
-def map_yaml(grid: Grid, image: str) -> bytes:
-    """map_server's description: image by relative path, origin the lower left corner of the lower left pixel."""
-    x, y = (float(value) + 0.0 for value in grid.origin)
-    lines = (
-        f"image: {image}",
-        "mode: trinary",
-        f"resolution: {grid.resolution:.6g}",
-        f"origin: [{x:.6f}, {y:.6f}, 0.0]",
-        "negate: 0",
-        f"occupied_thresh: {OCCUPIED}",
-        f"free_thresh: {FREE}",
-    )
-    return ("\n".join(lines) + "\n").encode()
-
-
-def map_files(grid: Grid, path: Array, lamps: Array | None = None) -> list[tuple[str, bytes]]:
-    """map.pgm, map.yaml and map.png by name, with ``path``, positions (n, 2 or more), and ``lamps``, (k, 2), in m."""
-    return [
-        ("map.pgm", pgm(grid)),
-        ("map.yaml", map_yaml(grid, "map.pgm")),
-        ("map.png", encode_png(map_drawing.draw(grid, path, lamps))),
-    ]

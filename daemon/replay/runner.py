@@ -13,31 +13,29 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+import estimator
 from daemon.config.schema import Config
 from daemon.devices.conversion import SampleBridge, ScanBridge
+from daemon.devices.light_setup import Lights
 from daemon.devices.photodiode import BlockWatch
 from daemon.health.assessment import REPLAYED, assess
 from daemon.health.faults import Fault
 from daemon.maps.container import BadMap
-from daemon.maps.store import Start, recorded_start
+from daemon.maps.grid_files import finest
+from daemon.maps.initial_state import begun, new_state, recorded_start, setup_of
+from daemon.maps.store import Start
 from daemon.maps.switching import take_over
 from daemon.recording.recorder import CycleEntry, light_of, switch_name
 from daemon.recording.replay_start import Restored
-from daemon.replay.results import finest
 from daemon.replay.sources import Event, Source, Turn
 from daemon.replay.trajectories import Ledger
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import Cycle, CycleRecord, Parts, Step
-from daemon.runtime.light_setup import Lights, begun, new_state, setup_of
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import CycleRecord, Parts, Step
 from daemon.runtime.vitals import vitals
 from daemon.runtime.worker import CycleWorker, ScheduledWorker
-from estimator import pipeline
-from estimator.mapping.map_snapshot import Identity, MapImage
-from estimator.mapping.occupancy_grid import Grid
-from estimator.measurements import UNLIMITED, Array, Limits, Order, Record
+from estimator import UNLIMITED, Array, Grid, Identity, Limits, MapImage, Order, Record, StepResult, image_of
 from estimator.paper import LUMILOOP, method
-from estimator.result import StepResult
-from estimator.stored_map import image_of
 from hal.adc import AdcStatus, RawSamples
 from hal.imu import RawImu
 from hal.lidar import Link, RawScan
@@ -45,7 +43,7 @@ from hal.odometry import RawOdometry
 
 if TYPE_CHECKING:  # loaded only where somebody asks for matches
     from daemon.replay.match_journal import MatchJournal
-    from estimator.state import State
+    from estimator import State
 
 
 class ReplayClock:
@@ -138,10 +136,10 @@ class Rerun:
         self._source = source
         self._clock = ReplayClock()
         self._localise = own and config.map.localise
-        settings = pipeline.Settings(history=True, localise=self._localise)
+        settings = estimator.Settings(history=True, localise=self._localise)
         if own:
             self._state = begun(lights, settings, start) if begin is None else begin.keep_history()
-            self._estimate: Step = partial(pipeline.step, self._state)
+            self._estimate: Step = partial(estimator.step, self._state)
         else:
             other = method(name)(settings, None if lights is None else setup_of(lights))
             self._state, self._estimate, lights = other.state, other.step, lights if other.lit else None
@@ -205,7 +203,7 @@ class Rerun:
         What the data say (:data:`~daemon.health.assessment.REPLAYED`) is said anew; all others are those that were
         published.
         """
-        now = vitals(self.cycle, set(), 0.0)
+        now = vitals(self.cycle.facts(), set(), 0.0)
         again = [fault for fault in assess(now, now) if fault in REPLAYED]
         return tuple(sorted([*again, *(fault for fault in Fault if fault in self._published - REPLAYED)]))
 
@@ -232,11 +230,11 @@ class Rerun:
 
     def finish(self) -> None:
         """The log has ended: poses take the places their anchors have now."""
-        self.ledger.settle(pipeline.keyframe_poses(self._state))
+        self.ledger.settle(estimator.keyframe_poses(self._state))
 
     def render(self) -> Grid:
         """The map at the finest resolution that its extent allows."""
-        return finest(partial(pipeline.render_map, self._state))
+        return finest(partial(estimator.render_map, self._state))
 
     def image(self, identity: Identity) -> MapImage:
         """The map as it is kept on a disk."""
@@ -269,7 +267,7 @@ class Rerun:
             self.cycle.inbox.put_command(command)
         if self._repeats:
             if entry.switched:
-                self.cycle.switch(partial(self._switch, entry.switched))
+                self.cycle.parts.switch.take_over = partial(self._switch, entry.switched)
             self._caps.now = entry.caps() or UNLIMITED
             self._answers[self.cycle.cycles + 1] = entry.answers
         self._source.status.link = Link.WAITING if entry.waiting else Link.STREAMING
@@ -294,8 +292,10 @@ class Rerun:
             start = recorded_start(path, sha256, self._lights, self._localise)
         except (OSError, BadMap) as error:
             raise LookupError(f"{path.name}, the map that the run went on in, cannot be used: {error}") from error
-        self.ledger.settle(pipeline.keyframe_poses(self._state))
-        take_over(self._state, new_state(self._lights, pipeline.Settings(history=True, localise=self._localise), start))
+        self.ledger.settle(estimator.keyframe_poses(self._state))
+        take_over(
+            self._state, new_state(self._lights, estimator.Settings(history=True, localise=self._localise), start)
+        )
         return start.stored.meta.map_id, sha256
 
     def _compare(self, entry: CycleEntry, record: CycleRecord) -> None:
@@ -331,7 +331,7 @@ class Rerun:
         if self._journal is not None:
             self._journal.begins(self.t_first)
         if any(getattr(record, "order", None) is Order.RESET for record in records):
-            self.ledger.settle(pipeline.keyframe_poses(self._state))
+            self.ledger.settle(estimator.keyframe_poses(self._state))
         begun = time.perf_counter()
         result = self._estimate(records, limits)
         self.timing.steps.append(time.perf_counter() - begun)
@@ -342,6 +342,6 @@ class Rerun:
         if self.watch is not None:
             self.watch(record)
         rows = len(self.ledger)
-        self.ledger.take(record, *self._latest)
+        self.ledger.add(record, *self._latest)
         if self._journal is not None:
             self._journal.gave(rows if len(self.ledger) > rows else None)

@@ -11,10 +11,8 @@ from typing import Final
 import numpy as np
 
 from daemon.replay.results import Trajectory
-from daemon.runtime.cycle import CycleRecord
-from estimator.measurements import Array
-from estimator.numerics import se2
-from estimator.result import Loop, StepResult
+from daemon.runtime.cycle_parts import CycleRecord
+from estimator import Array, Loop, StepResult, se2
 
 _FIELDS: Final = 12
 _STAMP, _ANCHOR, _STATE = 0, 1, 11
@@ -51,7 +49,7 @@ class Ledger:
         """Rows: what gave a pose."""
         return len(self._rows) // _FIELDS
 
-    def take(self, record: CycleRecord, stamp: float, t_mono: float) -> None:
+    def add(self, record: CycleRecord, stamp: float, t_mono: float) -> None:
         """Take in one cycle; ``stamp`` is the log's for the latest scan or block, which was true at ``t_mono``."""
         self.cycles += 1
         self.dropped += len(record.dropped)

@@ -1,8 +1,7 @@
 """Turns a cycle's time budget into caps, from measured times; nothing below the cycle reads a clock.
 
-Order of degradation when time is short (`estimator.measurements.Rung`): first iterations are cut and the scan is
-thinned, then map work waits, last the laser is left out where light or odometry can carry the pose. Neither is put off
-for good.
+Order of degradation when time is short (`estimator.DegradationLevel`): first iterations are cut and the scan thinned,
+then map work waits, last the laser is left out where light or odometry can carry the pose. Neither is put off for good.
 """
 
 from __future__ import annotations
@@ -13,9 +12,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
-from daemon.runtime.degradation import Ladder
-from estimator.measurements import UNLIMITED, Limits, Rung
-from estimator.result import StepResult
+from daemon.runtime.degradation import Degradation
+from estimator import UNLIMITED, DegradationLevel, Limits, StepResult
 
 ENOUGH_ITERATIONS: Final = 12
 """Iterations that a match hardly ever exceeds: more are cut first, for they are those of a second opinion; where these
@@ -36,7 +34,7 @@ PROBE_EVERY: Final = 40
 PROBES: Final = 3
 """Of so many cycles that pass the scan over, so many do not: they tell whether there is time again."""
 WORTH_IT: Final = 0.1
-"""Share of the budget that a rung must save to be taken because of overruns: what other programs take is no reason."""
+"""Share of the budget that a level must save to be taken because of overruns: what other programs take is no reason."""
 MEDIAN_OF: Final = 5
 """Measurements whose median counts: one step during which another process ran says nothing about the cost."""
 KNOWN_AFTER: Final = 3
@@ -127,7 +125,7 @@ class MeasuredBudget:
     """Real time: what a match, map work, light, and all the rest cost, tracked from cycle to cycle by stage.
 
     What is left of the budget after light and the rest is for matching and the map. Cycles with light and those without
-    have a ladder each, so that scans are not thinned, nor map work put off, in the ones for the sake of the others.
+    have a degradation each: in neither are scans thinned, or map work put off, for the sake of the other.
     """
 
     def __init__(self) -> None:
@@ -136,7 +134,7 @@ class MeasuredBudget:
         self._queries = 0
         self._waited = 0
         self._passed = 0
-        self._plain, self._lit = Ladder(), Ladder()
+        self._plain, self._lit = Degradation(), Degradation()
 
     def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
         """Caps for a step of a cycle that may take ``budget_us``; none for matching until something was measured."""
@@ -144,34 +142,38 @@ class MeasuredBudget:
         if self._pass.us <= 0.0:
             return replace(UNLIMITED, codes=codes)
         left_us = budget_us - self._rest.us - (self._light.us if light else 0.0)
-        rung = self._ladder(light).take(self._fits(left_us, budget_us))
-        if rung is Rung.CARRIED and not (carrier and self._pass_over()):
-            rung = Rung.NO_MAP
-        update_map = rung < Rung.NO_MAP or (rung is Rung.NO_MAP and self._waited >= LONGEST_MAP_WAIT)
+        level = self._degradation(light).choose(self._fits(left_us, budget_us))
+        if level is DegradationLevel.CARRIED and not (carrier and self._pass_over()):
+            level = DegradationLevel.NO_MAP
+        update_map = level < DegradationLevel.NO_MAP or (
+            level is DegradationLevel.NO_MAP and self._waited >= LONGEST_MAP_WAIT
+        )
         if update_map:
-            rung = min(rung, Rung.THINNED)
-        iterations, points = self._matching(left_us, update_map and self._fits(left_us, budget_us) < Rung.NO_MAP)
-        return Limits(iterations, points, update_map, codes, rung)
+            level = min(level, DegradationLevel.THINNED)
+        iterations, points = self._matching(
+            left_us, update_map and self._fits(left_us, budget_us) < DegradationLevel.NO_MAP
+        )
+        return Limits(iterations, points, update_map, codes, level)
 
-    def _ladder(self, light: bool) -> Ladder:
+    def _degradation(self, light: bool) -> Degradation:
         return self._lit if light else self._plain
 
     def _match_us(self, points: int) -> float:
         """What a match of so many points, or all there are, costs."""
         return self._pass.us * (FIXED + passes(ENOUGH_ITERATIONS, min(points, self._queries)))
 
-    def _fits(self, left_us: float, budget_us: float) -> Rung:
-        """The best rung that so many microseconds allow.
+    def _fits(self, left_us: float, budget_us: float) -> DegradationLevel:
+        """The best level that so many microseconds allow.
 
-        A match that does not fit is no reason to leave the laser out: overruns are (`Ladder`), or a cycle that would
-        take twice its budget, which is the whole period: scans would be lost.
+        A match that does not fit is no reason to leave the laser out: overruns are (`Degradation`), or a cycle that
+        would take twice its budget, which is the whole period: scans would be lost.
         """
         least_us = self._match_us(FEWEST_POINTS)
         if left_us >= self._match_us(self._queries) + self._map.us:
-            return Rung.FULL
+            return DegradationLevel.FULL
         if left_us >= least_us + self._map.us:
-            return Rung.THINNED
-        return Rung.NO_MAP if left_us + budget_us >= least_us else Rung.CARRIED
+            return DegradationLevel.THINNED
+        return DegradationLevel.NO_MAP if left_us + budget_us >= least_us else DegradationLevel.CARRIED
 
     def _pass_over(self) -> bool:
         """Whether a scan is passed over: now and then a few are not, or it would never be known that there is time."""
@@ -216,9 +218,13 @@ class MeasuredBudget:
             self._map.learn(us["map"])
         thinning_us = self._match_us(self._queries) - self._match_us(FEWEST_POINTS)
         mapping_us = us.get("map", 0)
-        saving = {Rung.FULL: max(thinning_us, mapping_us), Rung.THINNED: mapping_us, Rung.NO_MAP: us.get("match", 0)}
-        helps = saving.get(Rung(limits.rung), 0) > WORTH_IT * spent.budget_us
-        self._ladder(spent.light).ended(sum(us.values()) > spent.budget_us, helps)
+        saving = {
+            DegradationLevel.FULL: max(thinning_us, mapping_us),
+            DegradationLevel.THINNED: mapping_us,
+            DegradationLevel.NO_MAP: us.get("match", 0),
+        }
+        helps = saving.get(DegradationLevel(limits.level), 0) > WORTH_IT * spent.budget_us
+        self._degradation(spent.light).ended(sum(us.values()) > spent.budget_us, helps)
 
 
 def passes(iterations: int, points: int) -> float:

@@ -10,12 +10,11 @@ it when it is due, in real or in virtual time. What a cycle consumed and decided
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Final
 
-from daemon.devices.conversion import ImuBridge, OdometryBridge, SampleBridge, ScanBridge
-from daemon.devices.photodiode import BlockWatch
+from daemon.devices.conversion import ImuBridge, OdometryBridge
+from daemon.health.journal_fields import of_state
 from daemon.health.reasons import REASONS
 from daemon.health.reasons import Reason as Cause
 from daemon.integrity.evidence import SILENT_PERIODS, Evidence
@@ -27,99 +26,22 @@ from daemon.integrity.position_alert import Alarm, bounded
 from daemon.integrity.state_machine import judge
 from daemon.integrity.state_memory import Memory
 from daemon.maps.map_fallback import another, let_go
-from daemon.runtime.budget import Budget, Spent
-from daemon.runtime.inbox import Inbox, Taken
+from daemon.runtime.budget import Spent
+from daemon.runtime.cycle_facts import CycleFacts, PhotodiodeFacts
+from daemon.runtime.cycle_parts import CycleRecord, Parts
+from daemon.runtime.inbox import Taken
 from daemon.runtime.scan_period import ScanPeriod
-from daemon.runtime.snapshot_builder import Facts, Painter
-from daemon.runtime.stage_times import Laps, PulseTaker
-from daemon.runtime.worker import Worker
-from daemon.snapshot import Condition, Snapshot, Trust
-from daemon.system.logging import of_state
-from estimator.measurements import Answer, Command, LightEpoch, Limits, Order, Record, Rung, SampleBlock
-from estimator.result import Fix, StepResult
+from daemon.runtime.snapshot_builder import Facts
+from daemon.runtime.stage_times import TimingStatistics
+from daemon.snapshot import Snapshot, Trust
+from estimator import Answer, Command, DegradationLevel, Fix, LightEpoch, Limits, Order, Record, SampleBlock, StepResult
 from hal.adc import RawSamples
-from hal.clock import Clock
-from hal.lidar import LidarStatus, Link
+from hal.lidar import Link
 
 log = logging.getLogger(__name__)
 
 OWN_SHARE: Final = 0.5
 """Part of the scan period that is the budget where none is configured."""
-
-Sink = Callable[[Snapshot], None]
-"""Takes every snapshot; called from the loop thread, never waited for: it must return at once."""
-
-Step = Callable[[tuple[Record, ...], Limits], StepResult]
-"""The estimator with its state inside."""
-
-
-@dataclass(frozen=True, slots=True)
-class CycleRecord:
-    """What one cycle consumed and decided.
-
-    Attributes:
-        cycle: counts cycles from 1. t_mono: when it began.
-        scan: `RawScan.seq` of the scan consumed, None without one. dropped: those that a later scan replaced.
-        odometry, imu, samples: readings, and blocks of light samples, received since the start, all consumed by now.
-        commands: consumed. answers: job IDs of the answers applied, in order.
-        switched: SHA-256 of the stored map that the estimator has gone on in with this cycle, empty: none.
-        limits: the step's caps; None where nothing had arrived and no step was made.
-        result: of the step, or the previous one's; None before the first. snapshot: what was published.
-        stage_us: measured microseconds by stage, empty without a stopwatch. waiting: `Link.WAITING` of the lidar.
-    """
-
-    cycle: int
-    t_mono: float
-    scan: int | None
-    dropped: tuple[int, ...]
-    odometry: int
-    imu: int
-    commands: tuple[Command, ...]
-    answers: tuple[int, ...]
-    limits: Limits | None
-    result: StepResult | None
-    snapshot: Snapshot
-    stage_us: dict[str, int]
-    samples: int = 0
-    switched: str = ""
-    waiting: bool = False
-
-
-Tap = Callable[[CycleRecord], None]
-
-
-@dataclass(slots=True)
-class Parts:
-    """What a cycle is made of; every part can be replaced.
-
-    Attributes:
-        status: of the lidar driver, live. lidar, odometry: there is one.
-        samples, blocks: of the photodiode; None where there is none.
-        budget_us: time budget of a cycle, 0: half of the scan period.
-        stopwatch: seconds of a fine clock for the stages; None: nothing is measured, and nothing counts as overrun.
-        fault: number of the gravest present fault. condition: how the daemon's parts are. map_id: of the map frame.
-        alert_m: limit of the position error above which an alert is raised, 0: none. t_begun: start of the run; 0: now.
-    """
-
-    clock: Clock
-    step: Step
-    scans: ScanBridge
-    budget: Budget
-    worker: Worker
-    status: LidarStatus
-    lidar: bool = True
-    odometry: bool = False
-    samples: SampleBridge | None = None
-    blocks: BlockWatch | None = None
-    budget_us: float = 0.0
-    stopwatch: Callable[[], float] | None = None
-    sinks: list[Sink] = field(default_factory=list)
-    tap: Tap | None = None
-    fault: Callable[[], int] = int
-    condition: Callable[[], Condition | None] = lambda: None
-    map_id: int = 0
-    alert_m: float = 0.0
-    t_begun: float = 0.0
 
 
 class Cycle:
@@ -131,12 +53,12 @@ class Cycle:
         blocks: of light samples received so far. lamps: what is wrong with lamps and survey.
         alarm: compares the bound on the position error with its limit. trust: of the latest cycle.
         paused: by a command: map and laser are left alone, light and odometry carry the pose.
-        laps: stages of the latest cycle. taker: makes the published picture of how the cycle is doing.
+        stage_timer: stages of the latest cycle. timing: quantiles, degradation and stalls as they are published.
     """
 
     def __init__(self, parts: Parts) -> None:
         self.parts = parts
-        self.inbox = Inbox()
+        self.inbox = parts.inbox
         self.period = ScanPeriod()
         self.odometry = OdometryBridge()
         self.imu = ImuBridge()
@@ -147,7 +69,7 @@ class Cycle:
         self.result: StepResult | None = None
         begun = parts.t_begun or parts.clock.now()
         self.observer = Observer(begun, parts.odometry, parts.lidar, parts.samples is not None)
-        self._painter = Painter(parts.map_id)
+        self._builder = parts.snapshots
         self.cycle_us: int | None = None
         self.failing: set[int] = set()
         self.blocks = 0
@@ -155,32 +77,31 @@ class Cycle:
         self.alarm = Alarm(parts.alert_m)
         self.trust = Trust(limit_m=parts.alert_m or None, alert=self.alarm.on)
         self.paused = False
-        self._switch: Callable[[], tuple[int, str]] | None = None
         self._switched = ""
         self._held: list[Answer] = []
         self._left_out = LeftOut()
-        self.laps = Laps(parts.stopwatch)
-        self.taker = PulseTaker()
+        self.stage_timer = parts.timer
+        self.timing = TimingStatistics()
 
     def run(self) -> Snapshot:
         """Run one cycle with whatever has arrived."""
-        laps = self.laps
-        laps.begin()
+        timer = self.stage_timer
+        timer.begin()
         self.cycles += 1
         t_mono = self.parts.clock.now()
-        taken = self.inbox.take()
+        taken = self.inbox.drain()
         self._obey(taken.commands)
         answers = self._answers(t_mono)
         orders = [command for command in taken.commands if command.order not in (Order.PAUSE, Order.RESUME)]
         records = (*answers, *orders, *self._bridge(taken))
-        laps.lap("bridge")
+        timer.lap("bridge")
         limits = self._step(records)
         self._watch_lamps(t_mono, records, limits)
         verdict = self._judge(t_mono, records, None if limits is None else self.result)
-        snapshot = self._painter.paint(self.result, verdict, self._facts(self.parts.clock.now()))
-        laps.lap("judge")
+        snapshot = self._builder.build(self.result, verdict, self._facts(self.parts.clock.now()))
+        timer.lap("judge")
         self._publish(snapshot)
-        laps.lap("publish")
+        timer.lap("publish")
         self._account(t_mono, records, limits)
         if self.parts.tap is not None:
             record = CycleRecord(
@@ -195,7 +116,7 @@ class Cycle:
                 limits=limits,
                 result=self.result,
                 snapshot=snapshot,
-                stage_us=laps.us,
+                stage_us=timer.us,
                 samples=taken.samples_total,
                 switched=self._switched,
                 waiting=self.parts.status.link is Link.WAITING,
@@ -216,29 +137,18 @@ class Cycle:
         answers, self._held = tuple(replace(answer, t_begin=t_mono) for answer in self._held), []
         return answers
 
-    def switch(self, take_over: Callable[[], tuple[int, str]] | None) -> None:
-        """Before the next step, have the estimator go on in another map: ``take_over`` does it, tells ID and digest.
-
-        None: do not, after all; what has been taken over stays.
-        """
-        self._switch = take_over
-
-    def loops_seen(self, counter: int) -> None:
-        """Somebody has seen so many loops; see `Snapshot.loop_latched`."""
-        self._painter.loop_seen = counter
-
     def announce(self) -> None:
         """Publish where we stand without running a cycle: while the estimator is still being loaded."""
-        self._publish(self._painter.paint(None, self.verdict, self._facts(self.parts.clock.now())))
+        self._publish(self._builder.build(None, self.verdict, self._facts(self.parts.clock.now())))
 
     @property
     def map_id(self) -> int:
         """Identity of the map frame, another one after every RESET, and once a stored map was let go of."""
-        return self._painter.map_id
+        return self._builder.map_id
 
     @map_id.setter
     def map_id(self, map_id: int) -> None:
-        self._painter.map_id = map_id
+        self._builder.map_id = map_id
 
     @property
     def budget_us(self) -> float:
@@ -253,7 +163,7 @@ class Cycle:
             if (increment := self.odometry.increment(reading)) is not None:
                 records.append(increment)
             if self.odometry.jumps > jumps:
-                self.observer.witnesses.restart()
+                self.observer.motion_consistency.restart()
             self.observer.on_odometry(reading.t_rx)
             self.watch.on_odometry(reading)
         records += [turn for reading in taken.imu if (turn := self.imu.turn(reading)) is not None]
@@ -300,21 +210,20 @@ class Cycle:
         self._switched = ""
         if not records:
             return None
-        if (switch := self._switch) is not None:
-            self._switch = None
-            self._painter.map_id, self._switched = switch()
+        if (switched := self.parts.switch.carry_out()) is not None:
+            self._builder.map_id, self._switched = switched
         parts = self.parts
         light = any(isinstance(record, SampleBlock) for record in records)
         limits = parts.budget.limits(self.budget_us, light, self._carrier())
         if self.paused:
-            limits = replace(limits, update_map=False, rung=Rung.CARRIED)
+            limits = replace(limits, update_map=False, level=DegradationLevel.CARRIED)
         before, self.result = self.result, parts.step(records, limits)
-        self.laps.lap("step")
+        self.stage_timer.lap("step")
         self._tell_unused(limits)
         parts.worker.submit(self.result.jobs)
         reset = any(isinstance(record, Command) and record.order is Order.RESET for record in records)
         if let_go(before, self.result, self.map_id) or reset:
-            self._painter.map_id = another(self.map_id, self.result.t_mono)
+            self._builder.map_id = another(self.map_id, self.result.t_mono)
         return limits
 
     def _carrier(self) -> bool:
@@ -328,9 +237,9 @@ class Cycle:
         """Tell the judge that the laser is left out, and why."""
         if self.paused or self.observer.unused is Cause.PAUSED:
             self._left_out.clear()
-        overloaded = not self.paused and self._left_out.on_step(limits.rung >= Rung.CARRIED)
+        overloaded = not self.paused and self._left_out.on_step(limits.level >= DegradationLevel.CARRIED)
         self.observer.unused = Cause.PAUSED if self.paused else Cause.OVERLOADED if overloaded else None
-        self.taker.on_rung(limits.rung, self.paused)
+        self.timing.on_level(limits.level, self.paused)
 
     def _watch_lamps(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
         if limits is not None and self.result is not None:
@@ -356,12 +265,12 @@ class Cycle:
         gap = None if result is None else result.gap
         protection = None if result is None else result.protection
         if protection is None or not bounded(self.verdict, evidence):
-            return Trust(limit_m=limit_m, alert=self.alarm.take(t_mono, None), gap=gap, places=evidence.places)
+            return Trust(limit_m=limit_m, alert=self.alarm.update(t_mono, None), gap=gap, places=evidence.places)
         return Trust(
             horizontal_m=protection.horizontal_m,
             yaw_rad=protection.yaw_rad,
             limit_m=limit_m,
-            alert=self.alarm.take(t_mono, protection.horizontal_m),
+            alert=self.alarm.update(t_mono, protection.horizontal_m),
             laser=protection.laser,
             light=protection.light,
             wheels=protection.wheels,
@@ -389,7 +298,57 @@ class Cycle:
             fault=parts.fault(),
             condition=parts.condition(),
             trust=self.trust,
-            pulse=self.taker.pulse,
+            pulse=self.timing.latest,
+        )
+
+    def facts(self) -> CycleFacts:
+        """How cycles and their inputs are at this moment."""
+        parts, inbox, watch, t_mono = self.parts, self.inbox, self.watch, self.parts.clock.now()
+        result = self.result
+        return CycleFacts(
+            t_mono=t_mono,
+            state=self.verdict.state,
+            cycles=self.cycles,
+            overruns=self.overruns,
+            cycle_us=self.cycle_us,
+            timing=self.timing.latest,
+            short=self.timing.short,
+            period=self.period.seconds,
+            lidar=parts.status,
+            lidar_silent=self.lidar_ok(t_mono) is False and self.lidar_silence(t_mono) is not None,
+            scans_dropped=inbox.dropped,
+            scans_late=watch.late,
+            scans_misfit=watch.misfit,
+            lag_s=0.0 if result is None or result.lag is None else result.lag.lag_s,
+            odometry_ok=self.observer.odometry_ok(t_mono, inbox.wheels.latest),
+            odometry_jumps=self.odometry.jumps,
+            odometry_disagrees=watch.disagree,
+            readings=watch.readings,
+            readings_missed=watch.missed,
+            readings_old=watch.old,
+            readings_seldom=inbox.wheels.seldom(t_mono, self.period.seconds),
+            photodiode=self._photodiode(t_mono),
+            jobs_failed=parts.worker.failed,
+            alert=self.alarm.said,
+            sink_failing=bool(self.failing),
+        )
+
+    def _photodiode(self, t_mono: float) -> PhotodiodeFacts | None:
+        bridge, watch = self.parts.samples, self.parts.blocks
+        if bridge is None or watch is None:
+            return None
+        lights = None if self.result is None else self.result.lights
+        return PhotodiodeFacts(
+            ok=watch.ok(t_mono),
+            status=watch.status,
+            blocks=self.blocks,
+            blocks_lost=self.blocks_lost(),
+            blocks_dropped=self.inbox.blocks_dropped,
+            unfit=bridge.unfit - bridge.dead,
+            off_rate=bridge.off_rate,
+            stalled=self.lamps.stalled,
+            lamp_faults=self.lamps.faults,
+            links=0 if lights is None else len(lights.links),
         )
 
     def _publish(self, snapshot: Snapshot) -> None:
@@ -405,12 +364,12 @@ class Cycle:
                 self.failing.discard(number)
 
     def _account(self, t_mono: float, records: tuple[Record, ...], limits: Limits | None) -> None:
-        if self.parts.stopwatch is None:
+        if not self.stage_timer.measures:
             return
-        us, budget_us = self.laps.us, self.budget_us
+        us, budget_us = self.stage_timer.us, self.budget_us
         self.cycle_us = sum(us.values())
         self.overruns += self.cycle_us > budget_us
-        self.taker.on_cycle(t_mono, us)
+        self.timing.on_cycle(t_mono, us)
         if limits is not None and self.result is not None and not self.paused:
             light = any(isinstance(record, SampleBlock) for record in records)
             self.parts.budget.learn(Spent(us, budget_us, light), limits, self.result)

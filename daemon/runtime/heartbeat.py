@@ -11,7 +11,8 @@ from typing import Final
 
 from daemon.health.assessment import STALLED_PERIODS, WINDOW_S, Vitals, assess, describe
 from daemon.health.faults import Fault, describe_over
-from daemon.system.logging import of_fault
+from daemon.health.journal_fields import of_fault
+from daemon.health.present_faults import PresentFaults
 from daemon.system.sd_notify import notify
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,7 @@ class Heartbeat:
         vitals: takes a sample, given the loop's lateness in seconds.
         statistics: one line, for the service manager with every beat and for the log now and then.
         alive: whether the threads answer; else the watchdog is not fed.
+        present: takes the faults that are found.
     """
 
     def __init__(
@@ -37,8 +39,9 @@ class Heartbeat:
         vitals: Callable[[float], Vitals],
         statistics: Callable[[], str],
         alive: Callable[[], bool] = lambda: True,
+        present: PresentFaults | None = None,
     ) -> None:
-        self.faults: tuple[Fault, ...] = ()
+        self._present = present or PresentFaults()
         self._vitals = vitals
         self._statistics = statistics
         self._alive = alive
@@ -48,9 +51,10 @@ class Heartbeat:
         self._failing = False
         self._late = False
 
-    def fault(self) -> int:
-        """Number of the gravest present fault, 0 for none."""
-        return int(self.faults[0]) if self.faults else 0
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Those that are present, gravest first."""
+        return self._present.faults
 
     async def run(self) -> None:
         """Beat until cancelled.
@@ -106,4 +110,4 @@ class Heartbeat:
             if now.t_mono - last >= OVER_S:
                 del self._seen[fault]
                 log.info("%s", describe_over(fault, last - begun + BEAT_S), extra=of_fault(fault, over=True))
-        self.faults = faults
+        self._present.faults = faults

@@ -1,4 +1,4 @@
-"""How long something takes: a histogram of constant size over the last half minute to minute, and what it tells."""
+"""A histogram of durations of constant size over the last half minute to minute, and its quantiles."""
 
 from __future__ import annotations
 

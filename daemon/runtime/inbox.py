@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from daemon.integrity.arrival_monitor import Arrivals
-from estimator.measurements import Command
+from estimator import Command
 from hal.adc import RawSamples
 from hal.imu import RawImu
 from hal.lidar import RawScan
@@ -83,7 +83,7 @@ class Inbox:
     def put_odometry(self, reading: RawOdometry) -> None:
         """Hold a cumulative reading."""
         self._odometry_total += 1
-        self.wheels.take(reading.t_rx)
+        self.wheels.on_reading(reading.t_rx)
         self._odometry.append(reading)
         if len(self._odometry) > DEEPEST:
             self._odometry = self._odometry[::2]
@@ -99,7 +99,7 @@ class Inbox:
         """Hold an order; the latest few are kept."""
         self._commands = [*self._commands, command][-DEEPEST:]
 
-    def take(self) -> Taken:
+    def drain(self) -> Taken:
         """Everything that is held; the inbox is empty afterwards."""
         taken = Taken(
             self._scan,

@@ -77,7 +77,7 @@ class Pacemaker:
                 idle_until = loop.time() + IDLE_PERIODS * period
                 idle.at(idle_until)
                 await self._due
-                cycle.taker.late(cycle.parts.clock.now() - self._due_since)
+                cycle.timing.late(cycle.parts.clock.now() - self._due_since)
                 self._watch_stalls(period)
                 cycle.run()
         finally:
@@ -92,7 +92,7 @@ class Pacemaker:
             return
         self._latest = max(self._latest, lasted - IDLE_PERIODS * period)
         inside = (cycle.cycle_us or 0) * 1e-6 >= 0.5 * lasted
-        cycle.taker.stalled(lasted, cycle.laps.longest() if inside else Stage.OUTSIDE)
+        cycle.timing.stalled(lasted, cycle.stage_timer.longest() if inside else Stage.OUTSIDE)
 
     def _wake(self, since: float) -> None:
         if self._due is not None and not self._due.done():

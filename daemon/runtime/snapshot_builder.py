@@ -9,12 +9,20 @@ from typing import Final
 import numpy as np
 
 from daemon.integrity.state_memory import Memory
-from daemon.publish.modbus.lights_block import ROWS
-from daemon.snapshot import Condition, LightFix, LightLink, LightPicture, LinkUse, LoopReason, Pulse, Snapshot, Trust
-from estimator.measurements import Array
-from estimator.numerics import se2
-from estimator.result import Fix, Link, LinkState, Loop, StepResult
-from estimator.result import LoopReason as Why
+from daemon.snapshot import (
+    LISTED_LINKS,
+    Condition,
+    CycleTiming,
+    LightFix,
+    LightLink,
+    LightPicture,
+    LinkUse,
+    LoopReason,
+    Snapshot,
+    Trust,
+)
+from estimator import Array, Fix, Link, LinkState, Loop, StepResult, se2
+from estimator import LoopReason as Why
 
 Triple = tuple[float, float, float]
 
@@ -46,11 +54,11 @@ class Facts:
     fault: int = 0
     trust: Trust = NO_TRUST
     condition: Condition | None = None
-    pulse: Pulse | None = None
+    pulse: CycleTiming | None = None
 
 
 @dataclass(slots=True)
-class Painter:
+class SnapshotBuilder:
     """Numbers the snapshots and remembers the latest loop.
 
     Attributes:
@@ -63,7 +71,11 @@ class Painter:
     _loop: Loop | None = None
     _links: tuple[tuple[Link, ...], tuple[LightLink, ...]] = ((), ())
 
-    def paint(self, result: StepResult | None, verdict: Memory, facts: Facts) -> Snapshot:
+    def on_loops_seen(self, counter: int) -> None:
+        """Somebody has seen so many loops; see `Snapshot.loop_latched`."""
+        self.loop_seen = counter
+
+    def build(self, result: StepResult | None, verdict: Memory, facts: Facts) -> Snapshot:
         """One snapshot of this moment."""
         self._seq += 1
         if result is not None and result.loop is not None:
@@ -113,7 +125,7 @@ class Painter:
         """The first links as they are published; every other cycle brings no new ones."""
         links = () if result is None or result.lights is None else result.lights.links
         if links is not self._links[0]:
-            self._links = links, tuple([_link(link) for link in links[:ROWS]])
+            self._links = links, tuple([_link(link) for link in links[:LISTED_LINKS]])
         return self._links[1]
 
 
@@ -155,7 +167,7 @@ def _pose(result: StepResult) -> Triple:
 
 def _aged(result: StepResult, facts: Facts) -> Array:
     """The covariance now: a robot that nothing has told of since may have moved, as the next step will reckon."""
-    from estimator.fusion.motion_model import LARGEST_TURN, LONGEST_CARRY_S, UNSEEN  # loaded by the warm-up
+    from estimator import LARGEST_TURN, LONGEST_CARRY_S, UNSEEN  # loaded by the warm-up
 
     unseen = facts.t_mono - result.t_mono - LONGEST_CARRY_S
     if unseen <= 0.0:

@@ -7,21 +7,26 @@ from dataclasses import replace
 from typing import Final
 
 from daemon.runtime.histogram import HALF_S, Histogram
-from daemon.snapshot import Pulse, Stage
-from estimator.measurements import Rung
+from daemon.snapshot import CycleTiming, Stage
+from estimator import DegradationLevel
 
 NAMES: Final = {stage.name.lower(): stage for stage in Stage}
 REFRESH_S: Final = 1.0
 """Quantiles are worked out so often."""
 
 
-class Laps:
+class StageTimer:
     """The stages of the cycle that is running, by name; empty without a stopwatch."""
 
     def __init__(self, stopwatch: Callable[[], float] | None) -> None:
         self.us: dict[str, int] = {}
         self._stopwatch = stopwatch
         self._last = 0.0
+
+    @property
+    def measures(self) -> bool:
+        """Whether there is a stopwatch."""
+        return self._stopwatch is not None
 
     def begin(self) -> None:
         """A cycle begins."""
@@ -42,8 +47,8 @@ class Laps:
         return NAMES.get(max(self.us, key=self.us.__getitem__), Stage.STEP) if self.us else Stage.OUTSIDE
 
 
-class PulseTaker:
-    """Counts rungs, stalls and microseconds, and tells them as a :class:`Pulse`.
+class TimingStatistics:
+    """Counts degradation levels, stalls and microseconds, and tells them as a :class:`CycleTiming`.
 
     Attributes:
         short: cycles that left out map work or the laser for lack of time.
@@ -51,7 +56,7 @@ class PulseTaker:
 
     def __init__(self) -> None:
         self.short = 0
-        self.pulse = Pulse()
+        self.latest = CycleTiming()
         self._cycle, self._late = Histogram(), Histogram()
         self._stages = {name: Histogram() for name, stage in NAMES.items() if stage is not Stage.OUTSIDE}
         self._refresh = self._turn = 0.0
@@ -60,23 +65,23 @@ class PulseTaker:
         """A cycle begins so long after it was due."""
         self._late.add(max(0, round(seconds * 1e6)))
 
-    def on_rung(self, rung: int, paused: bool = False) -> None:
-        """A step was made on this rung."""
-        pulse = self.pulse
-        self.short += rung >= Rung.NO_MAP and not paused
-        if rung == Rung.FULL and pulse.rung == Rung.FULL:
+    def on_level(self, level: int, paused: bool = False) -> None:
+        """A step was made at this level."""
+        pulse = self.latest
+        self.short += level >= DegradationLevel.NO_MAP and not paused
+        if level == DegradationLevel.FULL and pulse.rung == DegradationLevel.FULL:
             return
-        self.pulse = replace(
+        self.latest = replace(
             pulse,
-            rung=rung,
-            thinned=pulse.thinned + (rung == Rung.THINNED),
-            without_map=pulse.without_map + (rung == Rung.NO_MAP),
-            carried=pulse.carried + (rung >= Rung.CARRIED),
+            rung=level,
+            thinned=pulse.thinned + (level == DegradationLevel.THINNED),
+            without_map=pulse.without_map + (level == DegradationLevel.NO_MAP),
+            carried=pulse.carried + (level >= DegradationLevel.CARRIED),
         )
 
     def stalled(self, seconds: float, where: Stage) -> None:
         """No cycle began for so long."""
-        self.pulse = replace(self.pulse, stalls=self.pulse.stalls + 1, stall_s=seconds, stall_in=where)
+        self.latest = replace(self.latest, stalls=self.latest.stalls + 1, stall_s=seconds, stall_in=where)
 
     def on_cycle(self, t_mono: float, us: dict[str, int]) -> None:
         """Take in the stages of a cycle that has ended."""
@@ -88,7 +93,7 @@ class PulseTaker:
         if t_mono >= self._refresh:
             self._refresh = t_mono + REFRESH_S
             stages = tuple([histogram.spread() for histogram in self._stages.values()])
-            self.pulse = replace(self.pulse, cycle=self._cycle.spread(), late=self._late.spread(), stages=stages)
+            self.latest = replace(self.latest, cycle=self._cycle.spread(), late=self._late.spread(), stages=stages)
         if t_mono >= self._turn:
             self._turn = t_mono + HALF_S
             for histogram in (self._cycle, self._late, *self._stages.values()):

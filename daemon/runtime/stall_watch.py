@@ -1,4 +1,4 @@
-"""When no cycle begins for two periods: what was the loop's thread doing, and for whom did it wait?
+"""Stall watch: when no cycle begins for two periods, logs what the loop's thread was doing and waiting for.
 
 One interval timer of the kernel, put forward at every cycle (about a microsecond); nothing runs while all is well.
 Where it goes off, Python calls the handler in the loop's thread between two instructions, with the frame that was

@@ -1,4 +1,4 @@
-"""Samples what the heartbeat judges, and says how the process itself is doing."""
+"""Vitals for the heartbeat and the line of statistics, from the facts about the cycle and the process."""
 
 from __future__ import annotations
 
@@ -9,89 +9,87 @@ from pathlib import Path
 from typing import Any
 
 from daemon.health.assessment import Vitals
-from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_facts import CycleFacts
+from daemon.snapshot import CycleTiming
 
 
-def vitals(cycle: Cycle, failed: set[str], lateness: float) -> Vitals:
+def vitals(facts: CycleFacts, failed: set[str], lateness: float) -> Vitals:
     """The vitals of this moment; ``failed``: names of parts that are down, ``lateness``: of the loop, seconds."""
-    parts, status, t_mono = cycle.parts, cycle.parts.status, cycle.parts.clock.now()
-    lag = None if cycle.result is None else cycle.result.lag
+    lidar = facts.lidar
     return Vitals(
-        t_mono=t_mono,
-        link=status.link,
-        error=status.error,
-        silent=cycle.lidar_ok(t_mono) is False and cycle.lidar_silence(t_mono) is not None,
-        scans=status.scans,
-        missed=status.missed + (cycle.inbox.dropped if cycle.cycles else 0),
-        invalid=status.invalid,
-        period=cycle.period.seconds,
-        odometry=cycle.observer.odometry_ok(t_mono, cycle.inbox.wheels.latest),
-        odometry_jumps=cycle.odometry.jumps,
-        disagree=cycle.watch.disagree,
-        late=cycle.watch.late,
-        misfit=cycle.watch.misfit,
-        lag=0.0 if lag is None else lag.lag_s,
-        readings=cycle.watch.readings,
-        readings_missed=cycle.watch.missed,
-        readings_old=cycle.watch.old,
-        readings_seldom=cycle.inbox.wheels.seldom(t_mono, cycle.period.seconds),
-        **_photodiode(cycle, t_mono),
-        cycles=cycle.cycles,
-        overruns=cycle.overruns,
-        short=cycle.taker.short,
-        jobs_failed=parts.worker.failed,
+        t_mono=facts.t_mono,
+        link=lidar.link,
+        error=lidar.error,
+        silent=facts.lidar_silent,
+        scans=lidar.scans,
+        missed=lidar.missed + (facts.scans_dropped if facts.cycles else 0),
+        invalid=lidar.invalid,
+        period=facts.period,
+        odometry=facts.odometry_ok,
+        odometry_jumps=facts.odometry_jumps,
+        disagree=facts.odometry_disagrees,
+        late=facts.scans_late,
+        misfit=facts.scans_misfit,
+        lag=facts.lag_s,
+        readings=facts.readings,
+        readings_missed=facts.readings_missed,
+        readings_old=facts.readings_old,
+        readings_seldom=facts.readings_seldom,
+        **_photodiode(facts),
+        cycles=facts.cycles,
+        overruns=facts.overruns,
+        short=facts.short,
+        jobs_failed=facts.jobs_failed,
         lateness=lateness,
-        alert=cycle.alarm.said,
-        failed=frozenset(failed) | (frozenset(["publisher"]) if cycle.failing else frozenset()),
+        alert=facts.alert,
+        failed=frozenset(failed) | (frozenset(["publisher"]) if facts.sink_failing else frozenset()),
     )
 
 
-def _photodiode(cycle: Cycle, t_mono: float) -> dict[str, Any]:
+def _photodiode(facts: CycleFacts) -> dict[str, Any]:
     """The part of the vitals that is the photodiode's; nothing where there is none."""
-    blocks, samples, lamps = cycle.parts.blocks, cycle.parts.samples, cycle.lamps
-    if blocks is None or samples is None:
+    photodiode = facts.photodiode
+    if photodiode is None:
         return {}
     return {
-        "adc": blocks.ok(t_mono),
-        "adc_link": blocks.status.link,
-        "adc_error": blocks.status.error,
-        "blocks": cycle.blocks,
-        "lost": blocks.status.dropped + (cycle.inbox.blocks_dropped if cycle.cycles else 0),
-        "unfit": samples.unfit - samples.dead,
-        "stalled": lamps.stalled,
-        "off_rate": samples.off_rate,
-        "lamps": lamps.faults if blocks.ok(t_mono) else frozenset(),
+        "adc": photodiode.ok,
+        "adc_link": photodiode.status.link,
+        "adc_error": photodiode.status.error,
+        "blocks": photodiode.blocks,
+        "lost": photodiode.status.dropped + (photodiode.blocks_dropped if facts.cycles else 0),
+        "unfit": photodiode.unfit,
+        "stalled": photodiode.stalled,
+        "off_rate": photodiode.off_rate,
+        "lamps": photodiode.lamp_faults if photodiode.ok else frozenset(),
     }
 
 
-def statistics(cycle: Cycle) -> str:
+def statistics(facts: CycleFacts) -> str:
     """One line for the log."""
-    status = cycle.parts.status
+    lidar = facts.lidar
     return (
-        f"state {cycle.verdict.state.name} cycles {cycle.cycles} overruns {cycle.overruns} scans {status.scans} "
-        f"missed {status.missed} dropped {cycle.inbox.dropped} invalid {status.invalid} resyncs {status.resyncs} "
-        f"reconnects {status.reconnects}{_light_statistics(cycle)} scan period {1e3 * cycle.period.seconds:.2f} ms "
-        f"{_cycle_statistics(cycle)} memory {resident_mb():.0f} MB"
+        f"state {facts.state.name} cycles {facts.cycles} overruns {facts.overruns} scans {lidar.scans} "
+        f"missed {lidar.missed} dropped {facts.scans_dropped} invalid {lidar.invalid} resyncs {lidar.resyncs} "
+        f"reconnects {lidar.reconnects}{_light_statistics(facts)} scan period {1e3 * facts.period:.2f} ms "
+        f"{_cycle_statistics(facts.timing)} memory {resident_mb():.0f} MB"
     )
 
 
-def _cycle_statistics(cycle: Cycle) -> str:
+def _cycle_statistics(timing: CycleTiming) -> str:
     """How long cycles take and how late they begin, over the last minute, and what they leave out."""
-    pulse = cycle.taker.pulse
-    said = [f"rung {pulse.rung} stalls {pulse.stalls}"]
-    for name, spread in (("cycle", pulse.cycle), ("late", pulse.late)):
+    parts = [f"rung {timing.rung} stalls {timing.stalls}"]
+    for name, spread in (("cycle", timing.cycle), ("late", timing.late)):
         if spread is not None:
-            said.append(f"{name} p50 {spread[0]} p99 {spread[1]} max {spread[2]} us")
-    return " ".join(said)
+            parts.append(f"{name} p50 {spread[0]} p99 {spread[1]} max {spread[2]} us")
+    return " ".join(parts)
 
 
-def _light_statistics(cycle: Cycle) -> str:
-    blocks, result = cycle.parts.blocks, cycle.result
-    if blocks is None:
+def _light_statistics(facts: CycleFacts) -> str:
+    light = facts.photodiode
+    if light is None:
         return ""
-    lights = None if result is None else result.lights
-    links = 0 if lights is None else len(lights.links)
-    return f" blocks {cycle.blocks} lost {cycle.blocks_lost()} recoveries {blocks.status.recoveries} links {links}"
+    recoveries = light.status.recoveries
+    return f" blocks {light.blocks} lost {light.blocks_lost} recoveries {recoveries} links {light.links}"
 
 
 def resident_mb() -> float:

@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.system.kernel_lock import KernelLock, before_compiling, waits
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 
 if TYPE_CHECKING:
-    from daemon.runtime.light_setup import Lights
+    from daemon.devices.light_setup import Lights
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | N
     What belongs to light is loaded only where ``lights`` says that there is a photodiode.
     """
     begun = time.monotonic()
-    loading = beside(load if lights is None else partial(load, lights), "warm-up")
+    loading = run_in_thread(load if lights is None else partial(load, lights), "warm-up")
     while not loading.done():
         await asyncio.wait([loading], timeout=REPORT_S)
         if not loading.done() and (line := _progress_line(time.monotonic() - begun, lights is not None)):
@@ -138,9 +138,9 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
 
 def _import(module: str) -> None:
     """Import a module of kernels that no daemon loads."""
-    from estimator.numerics.jit_cache import CACHE_DIR
+    from estimator import CACHE_DIR
 
-    with KernelLock(CACHE_DIR) as lock, before_compiling(lock.take):
+    with KernelLock(CACHE_DIR) as lock, before_compiling(lock.acquire):
         import_module(module)
 
 
@@ -165,14 +165,14 @@ def _announced(say: Callable[[str], None], before: set[Path]) -> Iterator[None]:
 
 
 def _compiled() -> set[Path]:
-    from estimator.numerics.jit_cache import CACHE_DIR
+    from estimator import CACHE_DIR
 
     return set(CACHE_DIR.rglob("*.nbc"))
 
 
 def mark_of(what: str) -> Path:
     """The file that says that an earlier start has compiled all that this one needs."""
-    from estimator.numerics.jit_cache import CACHE_DIR
+    from estimator import CACHE_DIR
 
     # the directory is named by the sources' content; numba also keys by the path they were loaded from, and by the
     # processor: a disk may be put into another computer
@@ -209,13 +209,13 @@ def is_warm(lights: bool) -> bool:
 
 
 def _load(begun: float, lights: Lights | None) -> Warmth:
-    from estimator.numerics.jit_cache import CACHE_DIR
+    from estimator import CACHE_DIR
 
     what = _what(lights is not None)
     with KernelLock(CACHE_DIR) as lock:
         compiled = False
         if not is_marked(what):
-            lock.take()
+            lock.acquire()
             compiled = not is_marked(what)  # who had the lock may have compiled them all
         cold = compiled
         if cold:
@@ -228,7 +228,7 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
         def missing() -> None:
             """A kernel is not there, whatever the mark says."""
             nonlocal compiled
-            lock.take()
+            lock.acquire()
             compiled = True
 
         with _uncollected(not cold), before_compiling(missing):
@@ -265,8 +265,7 @@ def _exercise() -> None:
     """Two steps with a small scan: what is imported or allocated on first use is so before the first real cycle."""
     import numpy as np
 
-    from estimator.measurements import UNLIMITED, Scan
-    from estimator.pipeline import new_state, step
+    from estimator import UNLIMITED, Scan, new_state, step
 
     state = new_state()
     bearing = np.linspace(-2.0, 2.0, 100)
@@ -280,10 +279,8 @@ def _exercise_lights(lights: Lights) -> float:
     """Steps with light in them; returns the microseconds that the search for one code takes on this computer."""
     import numpy as np
 
-    from daemon.runtime.light_setup import new_state
-    from estimator.cdma.decoder import decode, new_decoder, search
-    from estimator.measurements import UNLIMITED, SampleBlock
-    from estimator.pipeline import step
+    from daemon.maps.initial_state import new_state
+    from estimator import UNLIMITED, SampleBlock, decode, new_decoder, search, step
 
     profile, state = lights.profile, new_state(lights)
     words = np.round(2000.0 + 500.0 * np.sin(0.9 * np.arange(round(profile.epoch_s * profile.sample_rate)) ** 1.1))

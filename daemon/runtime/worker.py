@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Final, Protocol
 
-from estimator.measurements import Answer, Job
+from estimator import Answer, Job
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""The lock of the folder of compiled kernels: who compiles has it, who only loads them does without.
+"""The lock of the folder of compiled kernels: a process that compiles holds it; one that only loads needs none.
 
 numba writes each file of its cache beside and renames it: who reads meets a whole one or none, and compiles the kernel
 of which there is none. So nothing has to be waited for where all are there, whatever others do. Two who compile at once
@@ -40,7 +40,7 @@ class KernelLock:
             self._file.close()
             self._file = None
 
-    def take(self) -> None:
+    def acquire(self) -> None:
         """Have it from now on; says so where another process has it, and waits.
 
         Raises:

@@ -9,9 +9,7 @@ import socket
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
-
-from daemon.health.faults import FAULTS, Fault
+from typing import Final
 
 JOURNAL: Final = Path("/run/systemd/journal/socket")
 TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
@@ -20,31 +18,7 @@ PRIORITY: Final = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, lo
 LONGEST: Final = 32_768
 """Bytes of a message that are kept: a datagram has to take it."""
 
-FAULT_ID: Final = "0f26ad5c5f9d4f6fa1a3c8a7e7c1d9b4"
-OVER_ID: Final = "5c0cb1d0b8a64f27a0a5f5a4b0b9d3e1"
-STATE_ID: Final = "a7d9d3f86c0e4f21b1c4a98e2f63d07c"
-"""Message IDs of the journal's catalog (systemd/lumiloop.catalog). Part of the contract: never change."""
-
 Fields = Mapping[str, object]
-
-
-def of_fault(fault: Fault, over: bool = False) -> dict[str, Any]:
-    """``extra=`` of a line that tells that a fault has come, or is over."""
-    text, remedy = FAULTS[fault]
-    fields = {"LUMILOOP_FAULT": int(fault), "LUMILOOP_FAULT_NAME": fault.name, "LUMILOOP_MEANING": text}
-    if over:
-        return _extra({"MESSAGE_ID": OVER_ID, **fields})  # nothing needs to be done
-    return _extra({"MESSAGE_ID": FAULT_ID, **fields, "LUMILOOP_REMEDY": remedy})
-
-
-def of_state(state: str, reason: str, remedy: str) -> dict[str, Any]:
-    """``extra=`` of a line that tells what may be said about the pose from now on."""
-    fields = {"LUMILOOP_STATE": state, "LUMILOOP_REASON": reason, "LUMILOOP_REMEDY": remedy}
-    return _extra({"MESSAGE_ID": STATE_ID, **fields})
-
-
-def _extra(fields: Fields) -> dict[str, Any]:
-    return {"fields": fields}
 
 
 class Sparing:

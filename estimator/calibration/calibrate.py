@@ -85,7 +85,7 @@ class Calibrated:
         return first, last
 
 
-def calibrate(survey: Survey, rows: Rows, priors: Priors = PRIORS, start: Array | None = None) -> Calibrated:
+def calibrate_lamps(survey: Survey, rows: Rows, priors: Priors = PRIORS, start: Array | None = None) -> Calibrated:
     """Fit a survey to a drive.
 
     Args:

@@ -1,12 +1,11 @@
-"""I2C buses: the one seam between converter drivers and the kernel (a device node, a remote bus, or memory).
+"""The I2C bus interface between converter drivers and the kernel, a remote bus, or a simulated bus.
 
 A transaction is a list of messages joined by repeated starts, as ``ioctl(I2C_RDWR)`` takes it. Failures are
 ``OSError`` with the errno the kernel's adapter drivers use, so that a fake and a real bus fail alike.
 
-Drivers hold an :class:`AsyncBus`, which they get from a :class:`BusOpener`. There are two kinds of it:
-:mod:`hal.bus.i2c_thread` gives a blocking :class:`Bus` (:mod:`hal.bus.i2c_linux`, :mod:`hal.bus.i2c_remote`) a thread
-of its own, :mod:`hal.bus.i2c_memory` runs a bus that is nothing but memory inside the event loop, in virtual or real
-time.
+A driver obtains an :class:`AsyncBus` from a :class:`BusOpener`. It has two implementations:
+:mod:`hal.bus.i2c_thread` runs a blocking :class:`Bus` (:mod:`hal.bus.i2c_linux`, :mod:`hal.bus.i2c_remote`) in a thread
+of its own; :mod:`hal.bus.i2c_memory` runs a simulated bus inside the event loop, in virtual or real time.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ MAX_MESSAGES: Final = 42
 MAX_LENGTH: Final = 8192
 """Bytes of one message, as i2c-dev has it."""
 NACKS: Final = frozenset({errno.ENXIO, errno.EREMOTEIO})
-"""What a missing acknowledgement is called; which one depends on the adapter's driver."""
+"""Errnos of a missing acknowledgement; which one depends on the adapter's driver."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +44,8 @@ class Transferred:
 class Bus(Protocol):
     """An open bus. ``transfer`` blocks, so a real bus belongs to a thread of its own.
 
-    A memory bus under virtual time cannot block: it answers at once with ``t1`` in the future of the virtual clock, and
-    whoever called delivers the result when that time has come (:mod:`hal.bus.i2c_memory` does).
+    A memory bus under virtual time cannot block: it returns at once with ``t1`` in the future of the virtual clock, and
+    the caller delivers the result at that time (as :mod:`hal.bus.i2c_memory` does).
     """
 
     @property
@@ -56,7 +55,7 @@ class Bus(Protocol):
 
     @property
     def about(self) -> str:
-        """What the adapter calls itself (``bcm2835 (i2c@7e804000)``); empty where it does not."""
+        """The adapter's own name (``bcm2835 (i2c@7e804000)``); empty where it has none."""
         ...
 
     def transfer(self, messages: tuple[Message, ...]) -> Transferred:
@@ -68,11 +67,11 @@ class Bus(Protocol):
         ...
 
     def repeat(self, messages: tuple[Message, ...]) -> Generator[Transferred]:
-        """The same transaction again and again, with as little pause between as this bus can do; raises `OSError`."""
+        """Repeat the transaction with the shortest pause that this bus can do; raises `OSError`."""
         ...
 
     def release(self) -> None:
-        """Give up what of the bus is this program's alone; from another thread, while a transaction hangs."""
+        """Release exclusive claims on the bus; called from another thread while a transaction hangs."""
         ...
 
     def close(self) -> None:
@@ -81,7 +80,7 @@ class Bus(Protocol):
 
 
 OnRead = Callable[[Transferred, int], None]
-"""Called in the loop thread with a transaction, and how many before it nobody had time for (counted from the start)."""
+"""Called in the loop thread with a transaction and the number dropped before it, counted from the start."""
 
 
 class AsyncBus(Protocol):
@@ -104,26 +103,26 @@ class AsyncBus(Protocol):
     async def stream(self, messages: tuple[Message, ...], on_read: OnRead) -> None:
         """Repeat one transaction until cancelled; it never returns.
 
-        What the loop has no time to take is dropped: the latest wins.
+        A transaction that the loop has no time to receive is dropped: the latest wins.
 
         Raises:
-            OSError: what a transaction failed with; none follows it.
+            OSError: a transaction failed; no further one follows.
         """
         ...
 
     async def close(self) -> None:
-        """Close; idempotent. A transaction that hangs in the kernel is left to itself."""
+        """Close; idempotent. A transaction that hangs in the kernel is abandoned."""
         ...
 
 
 class BusOpener(Protocol):
-    """Opens a bus by its name. Drivers get this injected, so that a test can hand out memory buses."""
+    """Opens a bus by its name. It is injected into drivers, so that a test can supply memory buses."""
 
     async def __call__(self, name: str) -> AsyncBus:
         """Open ``name``.
 
         Raises:
-            DeviceMissing: nothing there. DeviceRefused: permission, busy, not an I2C bus.
+            DeviceMissing: no such bus. DeviceRefused: permission, busy, not an I2C bus.
         """
         ...
 
@@ -139,10 +138,10 @@ def write(address: int, data: bytes) -> Message:
 
 
 def check(messages: tuple[Message, ...]) -> None:
-    """Refuse what i2c-dev refuses, and the lengths that smbus2 would silently cut to 16 bits.
+    """Check the limits of i2c-dev, and the lengths that smbus2 would silently cut to 16 bits.
 
     Raises:
-        OSError: EINVAL, with what is wrong in words.
+        OSError: EINVAL, with the violated limit as text.
     """
     if not 1 <= len(messages) <= MAX_MESSAGES:
         raise OSError(errno.EINVAL, f"{len(messages)} messages: one transaction has 1 to {MAX_MESSAGES}")

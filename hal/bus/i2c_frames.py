@@ -1,16 +1,16 @@
-"""Frames of the remote I2C bus: how a bus is used over a unix or TCP socket. Pure codec, no I/O.
+"""Wire protocol of the remote I2C bus (unix or TCP socket). Pure codec, no I/O.
 
 All integers are big-endian, times are IEEE doubles in seconds. A frame is ``u32 length, u8 kind, body`` where
 ``length`` counts kind and body. A connection begins with one frame of the server, HELLO or REFUSED; after that the
-client sends TRANSFER and the server answers each with DONE, in order. A client may send ahead: transactions follow each
-other on the bus without waiting for the client. Whoever gets a frame that is not as described closes the connection.
+client sends TRANSFER and the server answers each with DONE, in order. A client may send ahead: the bus then does not
+wait for the client between transactions. A receiver of a malformed frame closes the connection.
 
 =========  ====  ==========================================================================================
 frame      kind  body
 =========  ====  ==========================================================================================
 HELLO      1     ``u32 0x4C493243 ("LI2C"), u8 version = 1, f64 now``; then the server's clock and the
                  adapter's own name, both as ``u16 length, UTF-8``
-REFUSED    2     ``u8 noun`` (1 missing, 2 refused, 3 fault); then problem and remedy, ``u16 length, UTF-8``
+REFUSED    2     ``u8 error`` (1 missing, 2 refused, 3 fault); then problem and remedy, ``u16 length, UTF-8``
 TRANSFER   3     ``u32 number, u8 messages``; for each ``u8 address, u8 flags`` (1: read), ``u16 length``,
                  and the bytes if it is a write
 DONE       4     ``u32 number, u16 errno`` (0: done), f64 received, f64 t0, f64 t1, f64 sent, u8 reads``;
@@ -18,7 +18,7 @@ DONE       4     ``u32 number, u16 errno`` (0: done), f64 received, f64 t0, f64 
 =========  ====  ==========================================================================================
 
 ``received, t0, t1, sent`` are the server's CLOCK_MONOTONIC. Its *clock* is a text that is equal on both sides if and
-only if both read the same CLOCK_MONOTONIC; if it is not, the client works out the difference from the four times.
+only if both read the same CLOCK_MONOTONIC; if it differs, the client estimates the offset from the four times.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ REFUSED: Final = 2
 TRANSFER: Final = 3
 DONE: Final = 4
 MAX_FRAME: Final = 64 + MAX_MESSAGES * (4 + MAX_LENGTH)
-NOUNS: Final[dict[int, type[HalError]]] = {1: DeviceMissing, 2: DeviceRefused, 3: DeviceFault}
+ERRORS: Final[dict[int, type[HalError]]] = {1: DeviceMissing, 2: DeviceRefused, 3: DeviceFault}
 
 _HEAD: Final = struct.Struct(">IB")
 _HELLO: Final = struct.Struct(">IBd")
@@ -55,7 +55,7 @@ class BadFrame(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """What a server says first: its time, which clock that is, and the adapter's own name."""
+    """The server's greeting: its time (s), the identity of its clock, and the adapter's own name."""
 
     now: float
     clock: str
@@ -64,7 +64,7 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The answer to a transaction; times are the server's. ``errno`` 0 means that it was carried out."""
+    """The result of a transaction; times are the server's. ``errno`` 0: success."""
 
     number: int
     errno: int
@@ -82,7 +82,7 @@ class Splitter:
         self._bytes = bytearray()
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Take bytes; give the frames that are complete, as kind and body. Raises `BadFrame` for a wrong length."""
+        """Append bytes; return the complete frames as kind and body. Raises `BadFrame` for a wrong length."""
         self._bytes += data
         frames: list[tuple[int, bytes]] = []
         while len(self._bytes) >= _HEAD.size:
@@ -98,7 +98,7 @@ class Splitter:
 
 
 class _Reader:
-    """Takes a body apart; every read beyond its end, and anything left over, is a `BadFrame`."""
+    """Parses a body; a read beyond its end, and bytes left over, raise `BadFrame`."""
 
     def __init__(self, body: bytes) -> None:
         self._body, self._at = body, 0
@@ -167,17 +167,17 @@ def parse_hello(body: bytes) -> Hello:
 
 def refused(error: HalError) -> bytes:
     """The frame that says why there is no bus."""
-    noun = next((number for number, kind in NOUNS.items() if isinstance(error, kind)), 3)
-    return frame(REFUSED, bytes([noun]) + _text(error.problem) + _text(error.remedy))
+    kind = next((code for code, cls in ERRORS.items() if isinstance(error, cls)), 3)
+    return frame(REFUSED, bytes([kind]) + _text(error.problem) + _text(error.remedy))
 
 
 def parse_refused(body: bytes, device: str) -> HalError:
     """Read a REFUSED as the error it stands for, told of ``device``; raises `BadFrame`."""
     reader = _Reader(body)
-    noun = NOUNS.get(reader.take(1)[0])
-    if noun is None:
+    kind = ERRORS.get(reader.take(1)[0])
+    if kind is None:
         raise BadFrame("an unknown kind of error")
-    error = noun(device, reader.text(), reader.text())
+    error = kind(device, reader.text(), reader.text())
     reader.end()
     return error
 

@@ -1,11 +1,11 @@
-"""A bus of this computer: ``/dev/i2c-N`` through smbus2, one ``ioctl(I2C_RDWR)`` a transaction.
+"""An I2C bus of this computer: ``/dev/i2c-N`` through smbus2, one ``ioctl(I2C_RDWR)`` per transaction.
 
-Before a read its buffer is filled with 0xFF, what a released bus reads as: a transfer that ends early without an error
-then shows, instead of the previous block's bytes. Messages are built once and used again as long as they are the same.
+The buffer of a read is filled with 0xFF first, the value of a released bus. A transfer that ends early without an
+error is then visible and does not return bytes of the previous block. Equal messages are built once and reused.
 
-An address belongs to who spoke to it first, until he closes the bus (an advisory lock, as serial ports have): two
-programs that read blocks of one converter would take each other's time on the bus, and each would see blocks of a slow
-one. Programs that know nothing of it, i2cdetect for one, are not kept away.
+The first program that uses an address holds an advisory lock on it until it closes the bus, as with serial ports. Two
+programs that read blocks of one converter would delay each other, and each would measure a slow converter. Programs
+without this lock, such as i2cdetect, are not stopped.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ DEV: Final = Path("/dev")
 _ADAPTER: Final = "adapter:"
 _GONE: Final = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ESHUTDOWN})
 ENABLE: Final = "enable I2C (Raspberry Pi: dtparam=i2c_arm=on) and load the module i2c-dev"
-"""What to do where there is no bus at all."""
+"""Remedy where the computer has no bus."""
 
 
 class LinuxBus:
@@ -79,12 +79,12 @@ class LinuxBus:
         return Transferred(t0, t1, tuple(_bytes(message) for message in self._reads))
 
     def repeat(self, messages: tuple[Message, ...]) -> Generator[Transferred]:
-        """The same transaction again and again."""
+        """Repeat the transaction."""
         while True:
             yield self.transfer(messages)
 
     def release(self) -> None:
-        """Let others have the addresses: a transaction that hangs keeps the file, and its locks, open."""
+        """Release the address locks: a transaction that hangs keeps the file, and its locks, open."""
         with self._closing:
             if self._link.fd is not None:
                 self._claimed.clear()
@@ -99,7 +99,7 @@ class LinuxBus:
     def _build(self, messages: tuple[Message, ...]) -> None:
         check(messages)
         for address in {message.address for message in messages} - self._claimed:
-            ioctl(self._link.fd or 0, I2C_SLAVE, address)  # I2C_RDWR itself would not look for a driver's claim
+            ioctl(self._link.fd or 0, I2C_SLAVE, address)  # I2C_RDWR itself does not check for a kernel driver
             _claim(self._link.fd or 0, address)
             self._claimed.add(address)
         self._built = [
@@ -113,7 +113,7 @@ class LinuxBus:
 
 
 def _claim(fd: int, address: int) -> None:
-    """Lock the byte of the device node whose offset is the address; of the open file, so that closing it frees it."""
+    """Lock the byte of the device node at the address's offset; the lock belongs to the open file and ends with it."""
     try:
         _lock(fd, fcntl.F_WRLCK, address, 1)
     except BlockingIOError:
@@ -134,7 +134,7 @@ def _bytes(message: i2c_msg) -> bytes:
 
 
 def buses() -> list[str]:
-    """Device nodes of the buses of this computer, by number."""
+    """Device nodes of this computer's buses, in order of their numbers."""
     numbers = [path.name.removeprefix("i2c-") for path in DEV.glob("i2c-*")]
     return [str(DEV / f"i2c-{number}") for number in sorted(int(text) for text in numbers if text.isdecimal())]
 
@@ -163,7 +163,7 @@ def open_linux(name: str) -> LinuxBus:
 
 
 def explain_open_error(name: str, path: Path, error: OSError) -> HalError:
-    """Turn what the operating system said about an open into one of the four nouns, with the remedy."""
+    """Turn the error of a failed open into one of the four kinds of :mod:`hal.errors`, with a remedy."""
     number = error.errno or 0
     if number in _GONE:
         there = buses()
@@ -189,7 +189,7 @@ def _group_of(path: Path) -> str:
 
 
 def _adapters() -> dict[str, str]:
-    """Own names of the adapters of this computer, by node (``i2c-1``)."""
+    """Names of this computer's adapters, by node (``i2c-1``)."""
     found: dict[str, str] = {}
     for folder in sorted(SYSFS.glob("i2c-*")):
         try:

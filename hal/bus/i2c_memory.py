@@ -1,7 +1,7 @@
-"""A bus that is nothing but memory, inside the event loop: in virtual time, or in real time behind a server.
+"""The interface of a simulated I2C bus, and its adapter to the event loop (virtual time, or real time behind a server).
 
-Such a bus does not block. It is told to begin a transaction, says at once when that will be over, and is asked for the
-result when the time has come: what it measures then lies in the past, also for whoever simulates the light.
+A simulated bus does not block. ``begin`` starts a transaction and returns its end time at once; ``finish`` returns the
+result at that time. The sampled interval then lies in the past, for the light simulation too.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from hal.clock import Clock
 
 
 class Pending(Protocol):
-    """A transaction that has begun."""
+    """A transaction in progress."""
 
     @property
     def t_end(self) -> float:
-        """``t_mono`` at which its caller gets the result."""
+        """``t_mono`` at which the result is available."""
         ...
 
     def finish(self) -> Transferred:
-        """The result; raises `OSError` if it failed."""
+        """Return the result; raises `OSError` if the transaction failed."""
         ...
 
 
@@ -43,7 +43,7 @@ class LoopBus:
     """A :class:`hal.bus.i2c.AsyncBus` over a memory bus.
 
     Args:
-        name: what errors call it. bus: the simulation. clock: the loop's, real or virtual.
+        name: for errors. bus: the simulation. clock: the loop's, real or virtual.
     """
 
     def __init__(self, name: str, bus: MemoryBus, clock: Clock) -> None:
@@ -61,14 +61,14 @@ class LoopBus:
         return self._bus.about
 
     async def transfer(self, messages: tuple[Message, ...]) -> Transferred:
-        """Carry out one transaction; raises `OSError` when its time is over."""
+        """Carry out one transaction; raises `OSError` at its end if it failed."""
         async with self._turn:
             pending = self._bus.begin(messages)
             await asyncio.sleep(pending.t_end - self._clock.now())
             return pending.finish()
 
     async def stream(self, messages: tuple[Message, ...], on_read: OnRead) -> None:
-        """Repeat one transaction until cancelled; nothing is ever dropped, the bus waits for the loop."""
+        """Repeat one transaction until cancelled; nothing is dropped: the bus waits for the loop."""
         while True:
             on_read(await self.transfer(messages), 0)
 

@@ -1,6 +1,6 @@
-"""The client of a remote bus (``unix:/path``, ``tcp://host:port``); :mod:`hal.bus.i2c_frames` describes the protocol.
+"""Client of a remote I2C bus (``unix:/path``, ``tcp://host:port``); the protocol is in :mod:`hal.bus.i2c_frames`.
 
-Repeated transactions are ordered one ahead, so that the bus does not wait for this process between two blocks.
+A repeated transaction is sent one ahead, so that the bus does not wait for this process between two blocks.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 DEFAULT_TCP_PORT: Final = 10941
 CONNECT_S: Final = 2.0
 REPLY_S: Final = 4.0
-"""Longer than any transaction: 8192 bytes at 100 kHz take 0.74 s, an adapter's time-out 1 s, one is ordered ahead."""
+"""Longer than any transaction: 8192 bytes at 100 kHz take 0.74 s, an adapter's time-out 1 s, one more is queued."""
 _START: Final = "start the bus server: python -m hal.bus.i2c_server BUS "
 
 
 def clock_name() -> str:
-    """Equal in two processes if and only if they read the same CLOCK_MONOTONIC; empty where that cannot be told."""
+    """Text that is equal in two processes if and only if they read the same CLOCK_MONOTONIC; empty where unknown."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot} {Path('/proc/self/ns/time').readlink()}"
@@ -38,11 +38,11 @@ def clock_name() -> str:
 
 
 class RemoteClock:
-    """Translates the server's clock to ours.
+    """Converts times of the server's clock to this computer's.
 
-    Every exchange bounds the difference from both sides: what we sent cannot arrive before it was sent, nor its answer.
-    The best of the latest bounds are kept for ``WINDOW`` exchanges, in which clocks drift apart by microseconds; bounds
-    that contradict each other show that one clock has been stepped, and only the latest count.
+    Each exchange bounds the offset from both sides: neither request nor answer arrives before it was sent. The tightest
+    bounds of the last ``WINDOW`` exchanges are used; clocks drift by microseconds in that time. Contradicting bounds
+    mean that a clock was stepped: all older ones are then dropped.
     """
 
     WINDOW: Final = 64
@@ -53,31 +53,31 @@ class RemoteClock:
         self._low: deque[float] = deque(maxlen=self.WINDOW)
         self._high: deque[float] = deque(maxlen=self.WINDOW)
 
-    def learn(self, ordered: float, received: float, sent: float, answered: float) -> None:
-        """One exchange: our times of order and answer, the server's of the same two frames.
+    def add(self, ordered: float, received: float, sent: float, answered: float) -> None:
+        """Add one exchange: our times of request and answer, the server's times of the same two frames (s).
 
         Raises:
-            BadFrame: it says that it reads our clock, but not these times.
+            BadFrame: the server claims our clock, but its times contradict it.
         """
         low, high = sent - answered, received - ordered
         if self._same and (low > self.TOLERANCE_S or high < -self.TOLERANCE_S):
-            raise frames.BadFrame("times from before the order or after the answer")
+            raise frames.BadFrame("times from before the request or after the answer")
         if self._low and (low > min(self._high) + self.TOLERANCE_S or high < max(self._low) - self.TOLERANCE_S):
             self._low.clear()
             self._high.clear()
         self._low.append(low)
         self._high.append(high)
 
-    def ours(self, theirs: float) -> float:
-        """A time of the server in our clock."""
+    def to_local(self, theirs: float) -> float:
+        """Convert a time of the server to our clock (s)."""
         if self._same or not self._low:
             return theirs
         return theirs - 0.5 * (max(self._low) + min(self._high))
 
 
 @dataclass(slots=True)
-class _Order:
-    """A transaction that has been ordered: when, bytes of its reads, and whether anybody still wants its answer."""
+class _Request:
+    """A pending transaction: time of the request, bytes of its reads, whether the answer is still wanted."""
 
     t: float
     lengths: tuple[int, ...]
@@ -87,20 +87,20 @@ class _Order:
         if answer.errno:
             return
         got = tuple(map(len, answer.reads))
-        if len(got) != len(self.lengths) or any(n > asked for n, asked in zip(got, self.lengths, strict=True)):
-            raise frames.BadFrame(f"reads of {got} bytes where {self.lengths} were ordered")
+        if len(got) != len(self.lengths) or any(n > limit for n, limit in zip(got, self.lengths, strict=True)):
+            raise frames.BadFrame(f"reads of {got} bytes where {self.lengths} were requested")
 
 
 class RemoteBus:
     """An open connection to a bus server; see :class:`hal.bus.i2c.Bus`. Made by `open_remote`. Not thread-safe."""
 
     def __init__(self, name: str, link: socket.socket) -> None:
-        """Wait for the server's greeting; raises `HalError` where there is none."""
+        """Receive the server's greeting; raises `HalError` where none comes."""
         self._name = name
         self._link: socket.socket | None = link
         self._splitter = frames.Splitter()
         self._inbox: deque[tuple[int, bytes]] = deque()
-        self._ordered: dict[int, _Order] = {}
+        self._pending: dict[int, _Request] = {}
         self._early: dict[int, frames.Done] = {}
         self._number = 0
         greeting = self._greeting()
@@ -114,28 +114,28 @@ class RemoteBus:
 
     @property
     def about(self) -> str:
-        """What the adapter at the other end calls itself."""
+        """The own name of the adapter at the server."""
         return self._about
 
     def transfer(self, messages: tuple[Message, ...]) -> Transferred:
         """Carry out one transaction; raises `OSError`, ENODEV where the connection is lost."""
-        return self._collect(self._order(messages))
+        return self._collect(self._send(messages))
 
     def repeat(self, messages: tuple[Message, ...]) -> Generator[Transferred]:
-        """The same transaction again and again, one ordered ahead."""
-        ahead = [self._order(messages)]
+        """Repeat the transaction, one request ahead."""
+        ahead = [self._send(messages)]
         try:
             while True:
-                ahead.append(self._order(messages))
+                ahead.append(self._send(messages))
                 yield self._collect(ahead.pop(0))
         finally:
-            for number in ahead:  # their answers are thrown away when they come
+            for number in ahead:  # their answers are dropped on arrival
                 self._early.pop(number, None)
-                if number in self._ordered:
-                    self._ordered[number].wanted = False
+                if number in self._pending:
+                    self._pending[number].wanted = False
 
     def release(self) -> None:
-        """Hang up: the server gives the bus up then, and who waits here for an answer is told that there is none."""
+        """Shut the connection down: the server releases the bus, and a pending read here fails."""
         if (link := self._link) is not None:
             with contextlib.suppress(OSError):  # it has been closed meanwhile
                 link.shutdown(socket.SHUT_RDWR)
@@ -146,11 +146,11 @@ class RemoteBus:
         if link is not None:
             link.close()
 
-    def _order(self, messages: tuple[Message, ...]) -> int:
+    def _send(self, messages: tuple[Message, ...]) -> int:
         check(messages)
         self._number = (self._number + 1) & 0xFFFFFFFF
         lengths = tuple(message.length for message in messages if message.length)
-        self._ordered[self._number] = _Order(time.monotonic(), lengths)
+        self._pending[self._number] = _Request(time.monotonic(), lengths)
         try:
             self._open_link().sendall(frames.transfer(self._number, messages))
         except OSError as error:
@@ -167,22 +167,22 @@ class RemoteBus:
                 self._early[answer.number] = answer
         if done.errno:
             raise OSError(done.errno, os.strerror(done.errno))
-        return Transferred(self._clock.ours(done.t0), self._clock.ours(done.t1), done.reads)
+        return Transferred(self._clock.to_local(done.t0), self._clock.to_local(done.t1), done.reads)
 
     def _answer(self) -> frames.Done | None:
-        """The next answer; None for one that nobody wants any more."""
+        """The next answer; None for one that is no longer wanted."""
         kind, body = self._frame()
         answered = time.monotonic()
         try:
             if kind != frames.DONE:
                 raise frames.BadFrame(f"a frame of kind {kind} instead of an answer")
             answer = frames.parse_done(body)
-            order = self._ordered.pop(answer.number, None)
-            if order is None:
-                raise frames.BadFrame(f"an answer to an order {answer.number} that there is not")
-            order.check(answer)
-            self._clock.learn(order.t, answer.received, answer.sent, answered)
-            return answer if order.wanted else None
+            request = self._pending.pop(answer.number, None)
+            if request is None:
+                raise frames.BadFrame(f"an answer to request {answer.number}, which was not sent")
+            request.check(answer)
+            self._clock.add(request.t, answer.received, answer.sent, answered)
+            return answer if request.wanted else None
         except frames.BadFrame as error:
             raise self._lost(OSError(errno.EPROTO, f"the bus server sent {error}")) from error
 
@@ -231,9 +231,9 @@ class RemoteBus:
         return self._link
 
     def _lost(self, error: OSError) -> OSError:
-        """Close, for nothing that still comes can be relied on; what to raise."""
+        """Close the connection, whose further data cannot be trusted; return the error to raise."""
         self.close()
-        self._ordered.clear()
+        self._pending.clear()
         if error.errno in (errno.ETIMEDOUT, errno.EPROTO, errno.ENODEV):
             return error
         if isinstance(error, ConnectionError):
@@ -259,8 +259,8 @@ def open_remote(name: str) -> RemoteBus:
     """Connect to a bus server within 2 s and wait for its greeting.
 
     Raises:
-        DeviceMissing: no server there, or no bus behind it. DeviceRefused: not a bus server, or a bus not for us.
-        DeviceFault: a server that does not answer.
+        DeviceMissing: no server, or no bus behind it. DeviceRefused: not a bus server, or no permission for the bus.
+        DeviceFault: the server does not answer.
     """
     address = parse_address(name)
     link: socket.socket | None = None

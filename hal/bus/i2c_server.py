@@ -5,11 +5,10 @@
     python -m hal.bus.i2c_server /dev/i2c-1 unix:/run/lumiloop/i2c
     python -m hal.bus.i2c_server adapter:bcm2835 tcp://127.0.0.1:10941
 
-In a process of its own, the thread that reads the bus competes with nobody for the interpreter, so that the times of
-its blocks are the kernel's. The bus is opened for each connection: a client that lost it comes back and has it again.
-There is no authentication, and whoever can connect can write to every chip of the bus. So a unix socket is for its
-owner only, and TCP is served on loopback addresses only, unless ``--anyone`` says otherwise; from another computer,
-``ssh -L 10941:127.0.0.1:10941 ROBOT`` is the better way.
+In a process of its own the bus thread does not compete for the interpreter lock, so that its block times are exact. The
+bus is opened for each connection: a client that reconnects opens it again. There is no authentication: every client can
+write to every chip on the bus. A unix socket is therefore accessible to its owner only, and TCP is served on loopback
+addresses only, unless ``--anyone`` is given. From another computer use ``ssh -L 10941:127.0.0.1:10941 ROBOT``.
 """
 
 from __future__ import annotations
@@ -28,23 +27,23 @@ from typing import Final
 from hal.bus import i2c_frames as frames
 from hal.bus.i2c import AsyncBus, BusOpener, Message, Transferred, check
 from hal.bus.i2c_remote import clock_name, parse_address
+from hal.bus.opening import open_bus
 from hal.clock import Clock, SystemClock
 from hal.errors import DeviceRefused, HalError
 from hal.net.inet import resolve
-from hal.port.opening import open_bus
-from hal.run_server import say, until_told
+from hal.run_server import print_line, until_stopped
 
 AHEAD: Final = 8
-"""Transactions a client may have ordered and not been answered; further bytes of it are not read meanwhile."""
+"""Most unanswered transactions of a client; its further bytes are not read meanwhile."""
 CLIENTS: Final = 8
 
 
 class BusServer:
-    """Serves one bus to any number of clients, whose transactions take turns.
+    """Serves one bus to several clients; their transactions alternate.
 
     Args:
         opener: opens the bus, once for each client. bus: its name for the opener. clock: the bus's.
-        anyone: listen also where other computers can connect.
+        anyone: also listen on addresses that other computers can reach.
     """
 
     def __init__(self, opener: BusOpener, bus: str, clock: Clock, *, anyone: bool = False) -> None:
@@ -58,15 +57,15 @@ class BusServer:
         """Begin to accept at ``unix:/path`` or ``tcp://host:port``; returns the address (port 0 chooses a free one).
 
         Raises:
-            DeviceMissing: a host name that is not known.
-            DeviceRefused: not an address, in use, not ours to use, or open to other computers without ``anyone``.
+            DeviceMissing: unknown host name.
+            DeviceRefused: not an address, in use, not permitted, or open to other computers without ``anyone``.
         """
         address = parse_address(where)
         if not isinstance(address, str) and not self._anyone:
             await _check_loopback(where, *address)
         try:
             if isinstance(address, str):
-                _make_way(Path(address))
+                _remove_stale_socket(Path(address))
                 self._server = await asyncio.start_unix_server(self._accept, sock=_private_socket(address))
                 self._path = Path(address)
                 return where
@@ -77,7 +76,7 @@ class BusServer:
         return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
 
     async def close(self) -> None:
-        """Stop accepting, hang up on all clients, remove the socket's file."""
+        """Stop accepting, disconnect all clients, remove the socket's file."""
         if self._server is not None:
             self._server.close()
         for task in self._clients:
@@ -110,11 +109,11 @@ class BusServer:
             return
         try:
             writer.write(frames.hello(self._clock.now(), self._clock_name, bus.about))
-            await self._talk(bus, reader, writer)
+            await self._receive(bus, reader, writer)
         finally:
             await bus.close()
 
-    async def _talk(self, bus: AsyncBus, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _receive(self, bus: AsyncBus, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         orders: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(AHEAD)
         worker = asyncio.create_task(self._work(bus, orders, writer))
         try:
@@ -135,7 +134,7 @@ class BusServer:
     async def _work(
         self, bus: AsyncBus, orders: asyncio.Queue[tuple[float, bytes]], writer: asyncio.StreamWriter
     ) -> None:
-        """Carry out orders one after the other, until one of them is no order."""
+        """Carry out the requested transactions in order, until a request is malformed."""
         while True:
             received, body = await orders.get()
             try:
@@ -163,7 +162,7 @@ async def _carry_out(bus: AsyncBus, messages: tuple[Message, ...]) -> tuple[int,
 async def _put(
     orders: asyncio.Queue[tuple[float, bytes]], order: tuple[float, bytes], worker: asyncio.Task[None]
 ) -> bool:
-    """Queue an order, waiting for room; False when nobody works any more."""
+    """Queue a request, waiting for room; False when the worker has ended."""
     putting = asyncio.ensure_future(orders.put(order))
     await asyncio.wait({putting, worker}, return_when=asyncio.FIRST_COMPLETED)
     if worker.done():
@@ -178,15 +177,15 @@ async def _check_loopback(where: str, host: str, port: int) -> None:
         raise DeviceRefused(where, "everyone who can reach that address could write to all chips of the bus", remedy)
 
 
-def _make_way(path: Path) -> None:
-    """Remove the socket of a server that has died; raises `DeviceRefused` for anything else that is there."""
+def _remove_stale_socket(path: Path) -> None:
+    """Remove the socket file of a dead server; raises `DeviceRefused` for anything else at that path."""
     if not path.exists():
         return
     if not stat.S_ISSOCK(path.stat().st_mode):
         raise DeviceRefused(str(path), "there is something that is no socket", "choose another path")
     with socket.socket(socket.AF_UNIX) as caller, contextlib.suppress(ConnectionRefusedError):
         caller.setblocking(False)
-        with contextlib.suppress(BlockingIOError):  # so many are waiting that it certainly listens
+        with contextlib.suppress(BlockingIOError):  # its queue of connections is full: it listens
             caller.connect(str(path))
         raise DeviceRefused(str(path), "another server listens there", "end it, or choose another path")
     path.unlink(missing_ok=True)
@@ -197,7 +196,7 @@ def _private_socket(path: str) -> socket.socket:
     sock = socket.socket(socket.AF_UNIX)
     try:
         sock.bind(path)
-        Path(path).chmod(0o600)  # before listen(), so that nobody gets in between
+        Path(path).chmod(0o600)  # before listen(): no client can connect earlier
     except OSError:
         sock.close()
         raise
@@ -205,13 +204,13 @@ def _private_socket(path: str) -> socket.socket:
 
 
 async def _main(bus: str, where: str, anyone: bool) -> None:
-    probe = await open_bus(bus)  # what is wrong with the bus is told at once, not when the first client comes
+    probe = await open_bus(bus)  # a problem with the bus shows at the start, not at the first client
     about = probe.about
     await probe.close()
     server = BusServer(open_bus, bus, SystemClock(), anyone=anyone)
     try:
-        say(f"{bus} {about} on {await server.listen(where)}".replace("  ", " "))
-        await until_told()
+        print_line(f"{bus} {about} on {await server.listen(where)}".replace("  ", " "))
+        await until_stopped()
     finally:
         await server.close()
 

@@ -1,11 +1,11 @@
-"""A thread of its own for a bus whose transactions block.
+"""Runs a blocking I2C bus in a thread of its own and delivers its transactions to the event loop.
 
-The thread does nothing but transactions. A block it has read waits in one place; if the loop has not taken it when the
-next one is there, it is dropped and counted. The interpreter's lock is free while the kernel works.
+The thread does nothing but transactions. One finished block waits for the loop; if the next one is complete before the
+loop has received it, it is dropped and counted. The interpreter lock is free while the kernel works.
 
-What the thread cannot help: ``t1`` is taken when it has the interpreter's lock again. Where the loop thread runs Python
-just then, that is late by up to the interpreter's switch interval. `hal.photodiode.sampler` marks such blocks, and a
-bus server of its own process (:mod:`hal.bus.i2c_server`) does not have them.
+``t1`` is read after the thread has regained the interpreter lock. While the loop thread runs Python, ``t1`` is late by
+up to the interpreter's switch interval. `hal.photodiode.sampler` marks such blocks. A bus server in a process of its
+own (:mod:`hal.bus.i2c_server`) does not have them.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from typing import Final
 from hal.bus.i2c import Bus, Message, OnRead, Transferred
 
 CLOSE_S: Final = 0.25
-"""Patience with a transaction in the kernel when the bus is closed; afterwards the thread ends by itself."""
+"""A close waits this long for a transaction in the kernel; after that the thread ends by itself."""
 
 IDLE_S: Final = 1.0
-"""How often a thread without work looks whether its loop is still there: one that just ended closes no bus."""
+"""Interval at which an idle thread checks whether its loop still runs: a loop that just ended closes no bus."""
 
 Post = Callable[..., None]
 
 
 class _Once:
-    """One transaction, ordered by the loop."""
+    """A single transaction, ordered by the loop."""
 
     def __init__(self, messages: tuple[Message, ...], future: asyncio.Future[Transferred], post: Post) -> None:
         self.messages, self.future, self.post = messages, future, post
@@ -38,14 +38,14 @@ class _Once:
     def run(self, bus: Bus) -> None:
         try:
             done = bus.transfer(self.messages)
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is raised again where it was ordered
+        except Exception as error:  # noqa: BLE001 - raised again in the loop
             self.post(_fail, self.future, error)
         else:
             self.post(_succeed, self.future, done)
 
 
 class _Stream:
-    """One transaction again and again."""
+    """A repeated transaction."""
 
     def __init__(self, messages: tuple[Message, ...], on_read: OnRead, ended: asyncio.Future[None], post: Post) -> None:
         self.messages, self.on_read, self.ended, self.post = messages, on_read, ended, post
@@ -55,15 +55,15 @@ class _Stream:
         self._dropped = 0
 
     def put(self, done: Transferred) -> None:
-        """Thread: hand over a block."""
+        """In the thread: pass a block to the loop."""
         with self._lock:
             fresh = self._latest is None
             self._dropped += not fresh
             self._latest = done
         if fresh:
-            self.post(self._take)
+            self.post(self._deliver)
 
-    def _take(self) -> None:
+    def _deliver(self) -> None:
         with self._lock:
             done, self._latest = self._latest, None
             dropped = self._dropped
@@ -121,7 +121,7 @@ class ThreadedBus:
             job.stopped = True
 
     async def close(self) -> None:
-        """End the thread, which closes the bus; a transaction that hangs is left to itself, and has no address then."""
+        """End the thread, which closes the bus; a transaction that hangs is abandoned and its address lock released."""
         if not self._closed:
             self._closed = True
             self._jobs.put(None)
@@ -140,13 +140,13 @@ class ThreadedBus:
     def _post(self, call: Callable[..., None], *arguments: object) -> None:
         try:
             self._loop.call_soon_threadsafe(call, *arguments)
-        except RuntimeError:  # the loop has been closed: nobody is waiting any more
+        except RuntimeError:  # the loop has been closed
             self._jobs.put(None)
 
     def _work(self, opener: Callable[[str], Bus]) -> None:
         try:
             bus = opener(self._name)
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is raised again where the bus was opened
+        except Exception as error:  # noqa: BLE001 - raised again where the bus was opened
             self._post(_fail, self.opened, error)
             return
         self._bus, self._about = bus, bus.about
@@ -157,7 +157,7 @@ class ThreadedBus:
         self._post(self._ended.set)
 
     def _next(self) -> _Job | None:
-        """What to do next, waited for; None when the bus is to be closed or the loop has been."""
+        """Wait for the next job; None when the bus is to be closed or the loop has been closed."""
         while not self._loop.is_closed():
             try:
                 return self._jobs.get(timeout=IDLE_S)
@@ -173,13 +173,13 @@ class ThreadedBus:
             with closing(bus.repeat(job.messages)) as transactions:
                 for done in transactions:
                     job.put(done)
-                    if job.stopped or not self._obey(bus):
+                    if job.stopped or not self._run_waiting(bus):
                         return
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is raised again where it was ordered
+        except Exception as error:  # noqa: BLE001 - raised again in the loop
             self._post(_fail, job.ended, error)
 
-    def _obey(self, bus: Bus) -> bool:
-        """Do what has been ordered meanwhile; False when the stream has to make way for it."""
+    def _run_waiting(self, bus: Bus) -> bool:
+        """Run the jobs ordered meanwhile; False where the stream must end for another one."""
         while not self._jobs.empty():
             job = self._jobs.get()
             if not isinstance(job, _Once):
@@ -205,6 +205,6 @@ async def open_threaded(name: str, opener: Callable[[str], Bus]) -> ThreadedBus:
     try:
         await bus.opened
     except asyncio.CancelledError:
-        bus._jobs.put(None)  # whenever the open returns, it is closed again
+        bus._jobs.put(None)  # closes the bus when the open returns
         raise
     return bus

@@ -1,4 +1,4 @@
-"""A simulated HOKUYO as a device of this computer, to try the daemon without a sensor.
+"""Command: a simulated HOKUYO as a device of this computer, to try the daemon without a sensor.
 
 python -m hal.fake --model UTM-30LX --pty /tmp/lidar
 python -m hal.fake --model UST-10LX --tcp 127.0.0.1:10940 --faults faults.toml --control /tmp/lidar.control
@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hal.errors import HalError
-from hal.fake.control import Control, serve_control
-from hal.fake.faults import FaultError
+from hal.fake.faults.control import Control, serve_control
+from hal.fake.faults.orders import FaultError
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import MODELS, LidarModel, Unit
 from hal.fake.lidar.scan import ScanSource
 from hal.fake.lidar.scan_world import RecordedRanges, Room
-from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule
-from hal.fake.tcp_server import TcpServer
-from hal.run_server import say, until_told
+from hal.fake.transport.pty_server import PtyServer
+from hal.fake.transport.tcp_server import TcpServer
+from hal.run_server import print_line, until_stopped
 
 
 @dataclass(slots=True)
@@ -85,20 +85,20 @@ async def _serve(options: _Options) -> None:
     schedule = FaultSchedule({"lidar": device})
     if options.faults is not None:
         faults = schedule.load(options.faults.read_text(encoding="utf-8"))
-        say(f"{len(faults)} faults of {options.faults} ordered")
+        print_line(f"{len(faults)} faults of {options.faults} ordered")
     pty = tcp = control = None
     try:
         if options.tcp is not None:
             host, _, port = options.tcp.rpartition(":")
             tcp = TcpServer(device)
-            say(f"{options.model} on tcp://{host}:{await tcp.listen(host, int(port))}")
+            print_line(f"{options.model} on tcp://{host}:{await tcp.listen(host, int(port))}")
         if options.pty is not None or options.tcp is None:
             pty = PtyServer(device, options.pty)
-            say(f"{options.model} on {pty.path}")
+            print_line(f"{options.model} on {pty.path}")
         if options.control is not None:
             control = await serve_control(Control(schedule), options.control)
-            say(f"fault orders on {options.control}")
-        await until_told(options.seconds)
+            print_line(f"fault orders on {options.control}")
+        await until_stopped(options.seconds)
     finally:
         schedule.close()
         if pty is not None:
@@ -109,8 +109,8 @@ async def _serve(options: _Options) -> None:
             control.close()
         device.close()
     counts = device.counts
-    say(
-        f"{device.scans_sent} scans made; replies: {counts.sent} sent, {counts.unheard} unheard, "
+    print_line(
+        f"{device.scans_sent} scans made; replies: {counts.sent} sent, {counts.without_host} unheard, "
         f"{counts.lost_in_sensor} lost in the sensor, {counts.refused_by_host} lost at a full queue"
     )
 

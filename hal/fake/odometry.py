@@ -1,7 +1,7 @@
-"""A robot's motor controller that sends odometry datagrams (docs/udp.md), with orderable faults.
+"""A simulated motor controller that sends odometry datagrams (docs/udp.md), with fault injection.
 
-It has its own encoder of the datagram. Readings come from a source of cumulative poses and leave through a function;
-what carries them (a socket, an input port in virtual time) is the caller's.
+It has its own encoder of the datagram. A source supplies cumulative poses; a function sends the datagrams (over a
+socket, or to an input port in virtual time).
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from collections.abc import Callable
 from random import Random
 from typing import Final
 
-from hal.fake.faults import Fault, Parameter, Vocabulary, Word
-from hal.fake.schedule import Orders
+from hal.fake.faults.orders import Fault, Parameter, Vocabulary, Word
+from hal.fake.faults.schedule import ActiveFaults
 
 Pose = tuple[float, float, float]
 Source = Callable[[float], tuple[float, Pose] | None]
-"""The first reading after a time: when it is due and the pose the wheels have counted since their start; None: none."""
+"""Returns the first reading after a time: its due time and the pose counted since the start; None: no more."""
 
 ODOMETRY: Vocabulary = {
     # the general words
@@ -36,7 +36,7 @@ ODOMETRY: Vocabulary = {
     "restart": Word("the controller starts anew: another session, counting from zero", "once"),
     "blocked": Word("the wheels' counters stand still; what was driven meanwhile is never counted", "lasts"),
 }  # fmt: skip
-"""By word. ``off stuck garbage wrong slow delayed intermittent`` mean what they mean for any device."""
+"""By word. ``off stuck garbage wrong slow delayed intermittent`` are common to all devices."""
 
 _SHARED_CLOCK: Final = 1
 _DATAGRAM: Final = struct.Struct("<4sHHIIIIdddd")
@@ -50,11 +50,11 @@ def datagram(session: int, seq: int, t_mono: float, pose: Pose) -> bytes:
 
 
 class FakeOdometry:
-    """Sends readings when they are due; a :class:`hal.fake.schedule.Target` of fault orders.
+    """Sends readings when they are due; a :class:`hal.fake.faults.schedule.Target` of fault orders.
 
     Args:
-        source: of readings, times in the loop's. send: takes a datagram, at the instant it arrives.
-        seed: of the strikes left to chance.
+        source: of readings, in the loop's time. send: receives a datagram at its arrival time.
+        seed: of the random strikes.
     """
 
     vocabulary = ODOMETRY
@@ -63,16 +63,16 @@ class FakeOdometry:
         self._source, self._send = source, send
         self._chance = Random(seed)
         self._loop = asyncio.get_running_loop()
-        self.orders = Orders(seed + 1)
+        self.orders = ActiveFaults(seed + 1)
         self.sent = 0
         self._session, self._seq = 1, 0
-        self._told: Pose = (0.0, 0.0, 0.0)
+        self._reported: Pose = (0.0, 0.0, 0.0)
         self._counted: Pose | None = None
         self._origin: Pose | None = None
         self._skipped = 0
 
     def check(self, fault: Fault) -> None:
-        """Nothing more to check than the ranges."""
+        """Accept every fault within its ranges."""
 
     def in_force(self) -> list[Fault]:
         """Faults that have not been lifted and have not spent their strikes."""
@@ -81,8 +81,8 @@ class FakeOdometry:
     def begin(self, fault: Fault) -> None:
         """A fault comes into force (one that happens once happens now)."""
         if fault.what == "jump":
-            x, y, yaw = self._told
-            self._told = (x + fault.number("by_m"), y, yaw)
+            x, y, yaw = self._reported
+            self._reported = (x + fault.number("by_m"), y, yaw)
         elif fault.what == "restart":
             self._restart()
         else:
@@ -102,20 +102,20 @@ class FakeOdometry:
             await asyncio.sleep(t - self._loop.time())
             self._count(pose)
             if not self.orders.on("off") and self._due():
-                self._tell(t)
+                self._send_reading(t)
 
     def _restart(self) -> None:
-        self._session, self._seq, self._told = self._session + 1, 0, (0.0, 0.0, 0.0)
+        self._session, self._seq, self._reported = self._session + 1, 0, (0.0, 0.0, 0.0)
 
     def _count(self, pose: Pose) -> None:
-        """Add what was driven since the last reading to what is told, as the faults in force leave it."""
+        """Add the motion since the last reading to the reported pose, altered by the faults in force."""
         before, self._counted = self._counted or pose, pose
         if self.orders.on("blocked") or self.orders.on("off"):
             return
         wrong = self.orders.on("wrong")
         ahead, left, turn = _between(before, pose)
         factor = wrong.number("factor") if wrong else 1.0
-        self._told = _then(self._told, (factor * ahead, factor * left, factor * turn))
+        self._reported = _then(self._reported, (factor * ahead, factor * left, factor * turn))
 
     def _due(self) -> bool:
         slow = self.orders.on("slow")
@@ -125,9 +125,9 @@ class FakeOdometry:
         self._skipped = 0
         return True
 
-    def _tell(self, t_mono: float) -> None:
+    def _send_reading(self, t_mono: float) -> None:
         if self.orders.on("stuck") is None or self._origin is None:
-            self._origin = self._told
+            self._origin = self._reported
         data = datagram(self._session, self._seq, t_mono, self._origin)
         self._seq += 1
         if self.orders.strike("intermittent"):
@@ -143,13 +143,13 @@ class FakeOdometry:
 
 
 def _between(a: Pose, b: Pose) -> Pose:
-    """Pose ``b`` seen from pose ``a``."""
+    """Pose ``b`` in the frame of pose ``a``."""
     c, s = math.cos(a[2]), math.sin(a[2])
     dx, dy = b[0] - a[0], b[1] - a[1]
     return c * dx + s * dy, -s * dx + c * dy, b[2] - a[2]
 
 
 def _then(a: Pose, step: Pose) -> Pose:
-    """The pose that lies at ``step`` as seen from pose ``a``."""
+    """Pose ``a`` composed with ``step``."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return a[0] + c * step[0] - s * step[1], a[1] + s * step[0] + c * step[1], a[2] + step[2]

@@ -1,7 +1,7 @@
-"""Sensor seconds to host seconds by the lower edge of a cloud: arrival is never early, only late.
+"""Maps sensor time to host time by the lower envelope of the delays: data arrive late, never early.
 
-The line under all points that lies closest to them is an edge of their convex hull (Moon, Skelly, Towsley: "Estimation
-and removal of clock skew from network delay measurements", INFOCOM 1999).
+The closest line below all points is an edge of their convex hull (Moon, Skelly, Towsley: "Estimation and removal of
+clock skew from network delay measurements", INFOCOM 1999).
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import math
 from collections import deque
 from typing import Final
 
-SLOPE_LIMIT: Final = 1.5e-3  # of sensor clock against host clock; quartz does 50e-6, accept much worse
+SLOPE_LIMIT: Final = 1.5e-3  # of sensor clock against host clock; a quartz has 50e-6, much worse is accepted
 LAG_S: Final = 0.020
-_LAG_LASTS_S: Final = 3.0  # a lag that came slowly and still lasts: the sensor's clock has moved
-_QUEUE_LASTS_S: Final = 600.0  # a lag that came at once: by then the rate's error (3e-5) has added up to a lag's worth
+_LAG_LASTS_S: Final = 3.0  # a slowly grown lag that lasts this long: the sensor's clock has moved
+_QUEUE_LASTS_S: Final = 600.0  # a sudden lag: by then the rate's error (3e-5) has added up to LAG_S
 _AT_ONCE_S: Final = 1.0  # from a quarter of LAG_S to all of it: ten times faster than a clock may be off (SLOPE_LIMIT)
-_BRIDGED: Final = 1e-4  # of the time without an edge: what its slope may have been off by
-_TELLS_S: Final = 10.0  # edges over so long tell the rate half: ways differ by 4 ms, rates of sensors by 4e-4
-_NEAR_S: Final = 1.0  # so far ahead of the last edge the line is the edges' own
+_BRIDGED: Final = 1e-4  # of the time without an edge: error of the extrapolated slope
+_RATE_HALF_S: Final = 10.0  # edges over this span weigh half in the rate: delays differ by 4 ms, sensor rates by 4e-4
+_NEAR_S: Final = 1.0  # up to here after the last edge the line keeps the slope of the edges
 _BIN_S: Final = 0.25
 _WINDOW_S: Final = 30.0
 _LOOK_BACK_S: Final = 2.0
@@ -26,10 +26,10 @@ _KEEP_BINS: Final = 8
 
 
 class Envelope:
-    """Lower edge of (arrival - stamp) over a sliding window, as a line in sensor time.
+    """Lower edge of the delay (arrival - stamp, s) over a sliding window, as a line in sensor time.
 
     Args:
-        period_s: between two points; a slow stream needs a longer window.
+        period_s: interval of the points, s; a slow stream needs a longer window.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -56,35 +56,35 @@ class Envelope:
 
     @property
     def lag_lasts(self) -> bool:
-        """True when all has come late for so long that it is not the way of the data but the sensor's clock.
+        """True when all points have lagged for so long that the cause is the sensor's clock, not the transport.
 
-        A clock is off by a rate, or it is set: then the stamps break their rhythm, which is found before. It does not
-        lose a tenth of a second from one scan to the next while the motor goes on in step; what comes at once is the
-        line, or the computer, and it holds up the data for as long as it likes.
+        A clock drifts by its rate, or it is set; a set clock breaks the rhythm of the stamps and is detected there. It
+        cannot lose 0.1 s between two scans while the motor turns evenly. A sudden lag is therefore the line or the
+        computer, which may hold up data for much longer than a clock takes to drift.
         """
         return self._t_last - self._lagging_since > (_QUEUE_LASTS_S if self._queued else _LAG_LASTS_S)
 
     def age(self, x: float) -> float:
-        """Sensor seconds since a point has last told anything about the edge."""
+        """Sensor seconds since the last point that constrained the edge."""
         return x - self._bins[-1][0] if self._bins else 0.0
 
     def delay(self, x: float) -> float:
         """Arrival less stamp of an undelayed scan, at sensor time ``x``; seconds.
 
-        Where all has come late for a while the line goes on as the clocks do, as far as that is known: the slope of a
-        few seconds is that of the way's own changes, and would lead it off by a millisecond a second.
+        Beyond the last edge the line continues with the long-term clock rate: the slope of a few seconds contains the
+        transport's own changes and would drift by a millisecond per second.
         """
         ahead = x - self._x0
         near = min(ahead, _NEAR_S)
         return self._base + self._slope * near + self._rate * (ahead - near)
 
     def feed(self, x: float, delay: float) -> float:
-        """Take a point; returns its excess over the edge as now known, >= 0, in seconds."""
+        """Add a point; returns its excess over the updated edge, >= 0, s."""
         if not self._bins:
             self._x0, self._base = x, delay
         excess = delay - self.delay(x)
         self._t_last = x + delay
-        if excess > self._lag(x):  # says nothing about the edge
+        if excess > self._lag(x):  # does not constrain the edge
             if math.isinf(self._lagging_since):
                 self._lagging_since = self._t_last
                 self._queued = self._t_last - excess - self._t_prompt < _AT_ONCE_S
@@ -102,12 +102,12 @@ class Envelope:
         return max(0.0, delay - self.delay(x))
 
     def _lag(self, x: float) -> float:
-        """Excess from which on a point is late; the last ones of a queue that runs dry are no edge either."""
+        """Excess from which a point counts as late; the last points of an emptying queue are no edge either."""
         over = LAG_S if math.isinf(self._lagging_since) else 0.25 * LAG_S + _BRIDGED * self.age(x)
         return min(over, LAG_S)
 
     def shift(self, seconds: float) -> None:
-        """Sensor times before now turn out to have been too late by this: the delays they gave were too short."""
+        """Correct past sensor times that were too late by ``seconds``: their delays were too short."""
         self._bins = deque((x, delay + seconds) for x, delay in self._bins)
         self._base += seconds
 
@@ -121,8 +121,8 @@ class Envelope:
     def _fit(self) -> None:
         """Tangent of the lower hull a little before the end of the window, its slope limited.
 
-        Under the middle it would be the line closest to all points; but periods close to a whole number of
-        milliseconds bend the edge, and it is the end of the window that is asked for.
+        A tangent below the middle would be closest to all points. But periods close to a whole number of milliseconds
+        bend the edge, and the estimate is needed at the end of the window.
         """
         hull: list[tuple[float, float]] = []
         for point in self._bins:
@@ -137,7 +137,7 @@ class Envelope:
             if x1 >= under:
                 break
         self._slope = min(max(slope, -SLOPE_LIMIT), SLOPE_LIMIT)
-        self._rate = self._slope / (1.0 + (_TELLS_S / max(last - first, _BIN_S)) ** 2)
+        self._rate = self._slope / (1.0 + (_RATE_HALF_S / max(last - first, _BIN_S)) ** 2)
         self._x0 = self._bins[-1][0]
         self._base = min(y + self._slope * (self._x0 - x) for x, y in hull)
 

@@ -1,4 +1,4 @@
-"""Where a HOKUYO may be plugged in, and what kind of line a device name stands for."""
+"""Search for device files behind which a HOKUYO may be, and the kind of line behind a device name."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _RS232: Final = re.compile(r"tty(USB|S|AMA|THS|mxc|SC|O|PS|XRUSB)\d+$")
 def candidates() -> list[str]:
     """Device files to try for ``auto``, most likely first, each real device once.
 
-    The stable name made by the udev rule, then ports whose USB vendor is HOKUYO, then serial adapters. A CDC-ACM port
-    that names another vendor is left alone: it is somebody else's microcontroller. Whatever is behind a serial adapter
-    gets to hear a QT at every line rate; where it must not, name the sensor's device file instead of ``auto``.
+    The order is: the stable name of the udev rule, ports whose USB vendor is HOKUYO, serial adapters. A CDC-ACM port of
+    another vendor is left out: it belongs to some other microcontroller. The device behind a serial adapter receives a
+    QT at every line rate; where it must not, name the sensor's device file instead of ``auto``.
     """
     found = [
         *_existing(_DEV / "lumiloop", "lidar"),
@@ -38,7 +38,7 @@ def _existing(folder: Path, pattern: str) -> Iterable[Path]:
 
 
 def _rank(real: Path) -> int | None:
-    """0: certainly ours. 1: cannot tell. None: certainly not."""
+    """0: a HOKUYO. 1: may be one. None: another device."""
     vendor = usb_vendor(real.name)
     if vendor == USB_VENDOR:
         return 0
@@ -48,7 +48,7 @@ def _rank(real: Path) -> int | None:
 
 
 def usb_vendor(tty: str) -> str:
-    """USB vendor of ``ttyACM0`` in lower-case hex; empty where sysfs does not say."""
+    """USB vendor of ``ttyACM0`` in lower-case hex; empty where sysfs does not give it."""
     device = _SYS_TTY / tty / "device"
     if not device.exists():
         return ""
@@ -63,8 +63,8 @@ def usb_vendor(tty: str) -> str:
 def is_rs232(device: str, baud: int = 0) -> bool:
     """True where the line rate matters: a UART or a USB-to-serial adapter, also behind a symbolic link.
 
-    Whatever else has a ``baud`` that somebody has written behind its name is taken for a line, too (a pseudo-terminal,
-    an adapter whose driver has a name of its own); USB CDC-ACM and Ethernet have no rate, whatever is written.
+    Any other device with a configured ``baud`` counts as a line, too (a pseudo-terminal, an adapter with an unusual
+    driver name). USB CDC-ACM and Ethernet never have a rate.
     """
     if not device.startswith("/"):
         return False

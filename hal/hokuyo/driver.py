@@ -1,9 +1,9 @@
-"""The HOKUYO driver: finds the sensor, streams, and comes back from everything a sensor or a cable can do.
+"""The HOKUYO driver: finds the sensor, streams, and recovers from failures of sensor and cable.
 
-What it does about trouble grows with every failure since scans last came: the stream is restarted (QT), the sensor
-is reset (RT or RS), the port is opened anew, the sensor is rebooted (RB, where the model has it), and again from the
-port on. Only valid scans set that back: a sensor that can be opened but never delivers must not look healthy
-(Hokuyo-aut/urg_node2 pull request 5). Waits grow from 0.2 to 5 s, and it never gives up.
+Recovery escalates with each failure since the last valid scans: restart the stream (QT), reset the sensor (RT or RS),
+reopen the port, reboot the sensor (RB, where the model has it), then reopen again. Only valid scans reset it: a sensor
+that opens but never delivers must not look healthy (Hokuyo-aut/urg_node2 pull request 5). Pauses grow from 0.2 to 5 s;
+the driver never gives up.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hal.hokuyo.scip import BAUD_RATES
 from hal.hokuyo.scip_line import Line
 from hal.hokuyo.session import AbnormalState, Session
 from hal.hokuyo.stream import ScanStream
-from hal.hokuyo.stream_watch import Follower
+from hal.hokuyo.stream_watch import StreamWatch
 from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
 from hal.port.port import PortOpener
 from hal.port.recovery import stay_connected
@@ -32,13 +32,13 @@ from hal.port.recovery import stay_connected
 log = logging.getLogger(__name__)
 
 AUTO: Final = "auto"
-_USB_BAUD: Final = 115200  # without meaning there, but a tty has to be given one
+_USB_BAUD: Final = 115200  # ignored by USB, but a tty needs a rate
 _PAUSE_S: Final = (0.2, 5.0)
 _RESET_FROM: Final = 2  # failures since the last run of valid scans
 _REOPEN_FROM: Final = 3
 _REBOOT_EVERY: Final = 4
 _GOOD_RUN: Final = 10  # valid scans of one stream
-_CALM_S: Final = 30.0  # of streaming, after which a problem is news again
+_CALM_S: Final = 30.0  # of streaming, after which a problem is logged again
 
 
 class HokuyoDriver:
@@ -46,15 +46,15 @@ class HokuyoDriver:
 
     Args:
         device: path, ``tcp://host:port``, or ``auto``: the first port at which a HOKUYO answers.
-        clock: gives the times of arrival; the same as the ports'.
+        clock: the clock of the ports' arrival times.
         opener: opens ports (:func:`hal.port.opening.open_port`).
-        serial: the sensor's own number (``VV SERI``); with ``auto`` it is found wherever it is plugged in.
-        baud: RS-232 rate to use; 0: the lowest that carries every revolution. No meaning on USB and Ethernet; a port
-            that is not known to be either is taken for an RS-232 line where it is given.
-        intensity: ask for intensities where model and firmware can give them.
+        serial: the sensor's serial number (``VV SERI``); with ``auto`` it is found at any port.
+        baud: RS-232 rate to use; 0: the lowest that carries every revolution. Ignored on USB and Ethernet; a port of
+            unknown kind counts as an RS-232 line where a rate is given.
+        intensity: request intensities where model and firmware support them.
 
     Raises:
-        ValueError: a rate SCIP does not know.
+        ValueError: a rate that SCIP does not have.
     """
 
     def __init__(
@@ -82,14 +82,14 @@ class HokuyoDriver:
         self._opened = False
         self._rate_cap = max(BAUD_RATES)
         self._rate_found = 0
-        self._told: set[str] = set()
-        self._loss_told = False
-        self._greeted = False
+        self._logged: set[str] = set()
+        self._loss_logged = False
+        self._announced = False
         self._random = random.Random(device + serial)
 
     @property
     def geometry(self) -> LidarGeometry | None:
-        """What the sensor last said of itself; None before the first time."""
+        """The geometry that the sensor last reported; None before the first time."""
         return self._geometry
 
     @property
@@ -98,13 +98,13 @@ class HokuyoDriver:
         return self._status
 
     async def run(self, on_scan: Callable[[RawScan], None]) -> None:
-        """Deliver scans until cancelled; then the laser is switched off, which takes a tenth of a second at most."""
+        """Deliver scans until cancelled; then switch the laser off, within 0.1 s."""
         await stay_connected(self._status, partial(self._connection, on_scan), self._note, self._pause)
 
     # one connection
 
     async def _connection(self, on_scan: Callable[[RawScan], None]) -> None:
-        """Open, stream, recover on the same port as long as that makes sense; returns or raises to have it reopened."""
+        """Open, stream, and recover on the open port; returns or raises when the port must be reopened."""
         self._status.link = Link.OPENING
         session = await self._find()
         if self._opened:
@@ -127,13 +127,13 @@ class HokuyoDriver:
             session.line.close()
 
     async def _mend(self, session: Session, error: HalError) -> bool:
-        """Make ready for another try on the same port; False: it has to be opened anew."""
+        """Prepare another stream on the open port; False where the port must be reopened."""
         self._status.link = Link.OPENING
         self._status.resyncs += 1
         identity = session.identity
         assert identity is not None
         turn_of_reboot = self._faults > 0 and self._faults % _REBOOT_EVERY == 0
-        if isinstance(error, AbnormalState) or (turn_of_reboot and identity.facts.may("RB")):
+        if isinstance(error, AbnormalState) or (turn_of_reboot and identity.facts.allows("RB")):
             await session.reboot()
             return False
         if self._faults >= _REOPEN_FROM or isinstance(error, DeviceRefused):
@@ -148,7 +148,7 @@ class HokuyoDriver:
         return True
 
     async def _find(self) -> Session:
-        """Open the device asked for, or the first candidate that is the sensor asked for."""
+        """Open the configured device, or the first candidate that is the configured sensor."""
         if self._device != AUTO:
             return await self._open(self._device)
         problems: list[HalError] = []
@@ -164,7 +164,7 @@ class HokuyoDriver:
         raise kind(AUTO, f"{wanted}: {'; '.join(map(str, problems))}")
 
     async def _open(self, device: str) -> Session:
-        """A session with a sensor that is idle, known, and the right one."""
+        """Return a session with the right sensor, idle and identified."""
         rs232 = discover.is_rs232(device, self._baud)
         port = await self._opener(device, self._rate_found or self._baud or (BAUD_RATES[0] if rs232 else _USB_BAUD))
         session = Session(Line(port))
@@ -198,7 +198,7 @@ class HokuyoDriver:
             raise
 
     async def _suit_rate(self, session: Session, identity: Identity) -> None:
-        """RS-232: go to the rate asked for, or the lowest that carries every revolution."""
+        """RS-232: change to the configured rate, or to the lowest that carries every revolution."""
         if not session.baud:
             return
         everything = ScanRequest("MD", identity.geometry.amin, identity.geometry.amax)
@@ -212,7 +212,7 @@ class HokuyoDriver:
                 self._rate_cap = max([rate for rate in BAUD_RATES if rate < wanted], default=BAUD_RATES[0])
                 if isinstance(error, DeviceFault):
                     raise
-                await self._suit_rate(session, identity)  # this side cannot do that rate: the next lower one
+                await self._suit_rate(session, identity)  # this host does not support that rate: try the next lower one
         self._rate_found = session.baud
 
     def _describe(self, device: str, session: Session, identity: Identity) -> None:
@@ -226,25 +226,25 @@ class HokuyoDriver:
     # one stream
 
     async def _stream(self, session: Session, on_scan: Callable[[RawScan], None]) -> None:
-        """Start the stream and follow it; raises what ended it."""
+        """Start the stream and watch it; raises the error that ended it."""
         identity = session.identity
         assert identity is not None
         speed = line_speed(session.device, session.baud, identity.facts)
         request = await self._choose(session, identity, speed)
         stream = ScanStream(identity, request, self._status, speed)
-        follower = Follower(stream, session.line, self._clock, self._status, self._passing(on_scan))
+        watch = StreamWatch(stream, session.line, self._clock, self._status, self._passing(on_scan))
         dialect = f"{identity.protocol or 'SCIP 2'} {request.name}"
         dialect += f", {request.cluster} steps together" if request.stride > 1 else ""
         dialect += f", every {request.skip + 1}. revolution" if request.skip else ""
         self._status.dialect = dialect
         try:
-            await session.start(request, follower.take, lambda: follower.has_scans)
-            await follower.watch()
+            await session.start(request, watch.receive, lambda: watch.has_scans)
+            await watch.watch()
         finally:
             session.line.on_frame = None
 
     async def _choose(self, session: Session, identity: Identity, speed: float) -> ScanRequest:
-        """The stream to ask for; a mode with intensities is proved by one scan first, and dropped if it fails."""
+        """Choose the stream; a mode with intensities is tested with one scan first and dropped if it fails."""
         request = stream_request(identity, intensity=self._intensity, bytes_per_s=speed)
         if not self._intensity:
             return request
@@ -258,7 +258,7 @@ class HokuyoDriver:
         return stream_request(identity, intensity=False, bytes_per_s=speed)
 
     def _passing(self, on_scan: Callable[[RawScan], None]) -> Callable[[RawScan], None]:
-        """Hands scans on; a run of them, not a single one, says that trouble is over (a stuck sensor sends one)."""
+        """Return a callback that passes scans on and resets recovery after a run of them (a stuck sensor sends one)."""
         began, count = self._clock.now(), 0
 
         def pass_on(scan: RawScan) -> None:
@@ -267,34 +267,34 @@ class HokuyoDriver:
             self._status.link = Link.STREAMING
             if count == _GOOD_RUN:
                 self._faults = self._attempts = 0
-                if self._loss_told or not self._greeted:
-                    word = "delivers again" if self._loss_told else f"(serial {scan.geometry.serial}) delivers"
+                if self._loss_logged or not self._announced:
+                    word = "delivers again" if self._loss_logged else f"(serial {scan.geometry.serial}) delivers"
                     log.info("%s: lidar %s %s", self._status.extra["device"], scan.geometry.model, word)
-                    self._loss_told, self._greeted = False, True
-            if self._told and scan.t_rx - began > _CALM_S:
-                self._told.clear()
+                    self._loss_logged, self._announced = False, True
+            if self._logged and scan.t_rx - began > _CALM_S:
+                self._logged.clear()
             on_scan(scan)
 
         return pass_on
 
-    # trouble
+    # failures
 
     def _note(self, error: HalError) -> None:
-        """Keep the error for the status; log each kind of problem once until scans have come for a while.
+        """Store the error in the status; log each problem once until scans have arrived for a while.
 
-        As information: whoever runs the driver warns of faults that last, by their number.
+        The level is INFO: the daemon warns of lasting faults by their number.
         """
         self._status.error = error
         self._attempts += 1
         if not isinstance(error, (DeviceMissing, DeviceRefused)):
             self._faults += 1
-        if error.problem not in self._told:
-            self._told.add(error.problem)
-            self._loss_told = True
+        if error.problem not in self._logged:
+            self._logged.add(error.problem)
+            self._loss_logged = True
             log.info("lidar lost: %s", error)
 
     def _pause(self) -> float:
-        """Seconds until the next attempt: doubling, with jitter so that several hosts do not march in step."""
+        """Seconds until the next attempt: doubling, with jitter against synchronised hosts."""
         low, high = _PAUSE_S
         pause = min(low * 2.0 ** min(max(self._attempts - 1, 0), 10), high)
         return pause * self._random.uniform(0.8, 1.0)

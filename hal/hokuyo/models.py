@@ -1,7 +1,7 @@
-"""What each HOKUYO model may be asked, what its odd values mean, and how late its data are.
+"""Facts about HOKUYO models: safe commands, error codes, intensity limits, line speeds; identification from VV and PP.
 
-Geometry is never taken from here: a sensor states it in ``PP``. These are the facts it does not state. Sources: SCIP
-specifications C-42-03320B, C-42-04076, C-42-03907; field reports named at the entries.
+Geometry is never taken from here: a sensor reports it in ``PP``. Sources: SCIP specifications C-42-03320B, C-42-04076,
+C-42-03907; field reports named at the entries.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ModelFacts:
             (ros-drivers/urg_c PR 4, ros-drivers/urg_node issue 23).
         codes: meaning of values below DMIN.
         no_return_from: values from here on are no distance even if DMAX allows them; 0: DMAX alone decides.
-        line: how it is usually wired, where the name of the port does not tell.
+        line: usual connection, where the port's name does not show it.
         intensity_swath_deg: widest safe field of view with intensity at cluster 1, by firmware; "" is any other
             firmware. Empty: no limit.
     """
@@ -65,13 +65,13 @@ class ModelFacts:
     line: Literal["usb", "ethernet"] = "usb"
     intensity_swath_deg: dict[str, float] = field(default_factory=dict)
 
-    def may(self, command: str) -> bool:
+    def allows(self, command: str) -> bool:
         """True where ``command`` (two letters) is safe to send."""
         return command[:2] in self.commands
 
 
 _FAMILIES: Final[tuple[tuple[str, ModelFacts], ...]] = (
-    # a fragment of PROD (of VV) or MODL (of PP); the first that fits
+    # a fragment of PROD (of VV) or MODL (of PP); the first match counts
     ("URG-04LX", ModelFacts("URG-04LX", _CORE, _URG_CODES)),
     ("UBG-04LX", ModelFacts("UBG-04LX", _CORE, _URG_CODES)),
     ("UHG-08LX", ModelFacts("UHG-08LX", _CORE, _URG_CODES)),
@@ -85,14 +85,14 @@ _FAMILIES: Final[tuple[tuple[str, ModelFacts], ...]] = (
     ("UXM-30LX", ModelFacts("UXM-30LX", _MULTI_ECHO, _UTM_CODES, line="ethernet")),
 )
 UNKNOWN_MODEL: Final = ModelFacts("unknown model", _INTENSITY)
-"""For models not listed; intensity is still verified by one counted scan before it is relied on."""
+"""For models not listed; intensity is still tested with one counted scan before use."""
 
-BEFORE_KNOWN: Final = ModelFacts("not yet identified", frozenset({"VV", "PP", "QT", "RS", "TM", "SC"}))
-"""What may be sent to a sensor before it has said who it is."""
+BEFORE_IDENTIFIED: Final = ModelFacts("not yet identified", frozenset({"VV", "PP", "QT", "RS", "TM", "SC"}))
+"""Commands that are safe before the sensor is identified."""
 
 
 def facts_of(product: str, model: str) -> ModelFacts:
-    """Facts by what VV calls the product and PP the model."""
+    """Facts for the product of VV and the model of PP."""
     for text in (product, model):
         for fragment, facts in _FAMILIES:
             if fragment in text:
@@ -110,7 +110,7 @@ class Identity:
     facts: ModelFacts
 
     def code_text(self, value: int) -> str:
-        """What a value that is no distance says, for people."""
+        """Meaning of a value that is no distance, for people."""
         if value > self.geometry.dmax:
             return "no return"
         return self.facts.codes.get(value, "error code without published meaning")
@@ -121,10 +121,10 @@ _PP_NUMBERS: Final = ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")
 
 
 def identify(device: str, vv: dict[str, str], pp: dict[str, str]) -> Identity:
-    """Make an identity of the text lines of VV (may be empty) and PP.
+    """Build the identity from the text lines of VV (may be empty) and PP.
 
     Raises:
-        DeviceRefused: PP lacks a key or contradicts itself, or the firmware is of the time before SCIP 2.0.
+        DeviceRefused: PP lacks a key or contradicts itself, or the firmware is older than SCIP 2.0.
     """
     numbers: dict[str, int] = {}
     for key in _PP_NUMBERS:
@@ -161,17 +161,17 @@ def identify(device: str, vv: dict[str, str], pp: dict[str, str]) -> Identity:
 
 
 def stream_request(identity: Identity, *, intensity: bool, bytes_per_s: float) -> ScanRequest:
-    """The endless stream to ask for: all steps of all revolutions if model and line can carry it.
+    """The endless stream to request: all steps of all revolutions if model and line can carry it.
 
     A slow line first gets clusters of 2 and 3 steps, then every second to tenth revolution.
 
     Args:
         identity: of the sensor.
-        intensity: ask for ME; clusters are formed where a model's intensity mode is unsafe over the full field of view.
-        bytes_per_s: what the line carries.
+        intensity: request ME; clusters are formed where a model's intensity mode is unsafe over the full field of view.
+        bytes_per_s: capacity of the line.
     """
     geometry, facts = identity.geometry, identity.facts
-    name = "ME" if intensity and facts.may("ME") else "MD"
+    name = "ME" if intensity and facts.allows("ME") else "MD"
     least = 1
     limits = facts.intensity_swath_deg
     if name == "ME" and limits:
@@ -200,7 +200,7 @@ def line_speed(device: str, baud: int, facts: ModelFacts) -> float:
     Args:
         device: as opened; symbolic links already followed where it is a path.
         baud: rate of an RS-232 line in bit/s, 0 where there is none.
-        facts: whose usual line is taken where the name does not tell.
+        facts: give the usual line where the name does not show it.
     """
     if baud > 0:
         return baud / 10.0

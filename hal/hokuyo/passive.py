@@ -1,7 +1,7 @@
-"""A listener that never speaks: scans from received bytes alone, for recorded captures.
+"""Decodes scans from the received bytes of a recorded capture, without sending anything.
 
-It runs the same splitter, codec and clock code as the live driver, and gives scans the same times where it is told the
-port's name and line rate.
+It uses the splitter, codec and clock of the live driver, and yields the same scan times where the port's name and line
+rate are given.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ _SCANS = frozenset({b"MD", b"MS", b"ME", b"ND", b"NE", b"GD", b"GS", b"GE", b"HD
 
 
 class PassiveHokuyo:
-    """Decodes what a sensor sent, without having seen what it was asked.
+    """Decodes a sensor's replies without the commands of the host.
 
-    Geometry comes from VV and PP replies in the bytes; until a PP has come, from ``geometry``; with neither, scans are
-    passed over and counted in ``status.invalid``. The stream's shape comes from the echo of each reply.
+    Geometry comes from VV and PP replies in the bytes; before the first PP, from ``geometry``; with neither, scans are
+    dropped and counted in ``status.invalid``. The stream's shape comes from the echo of each reply.
 
     Args:
         geometry: used until the bytes hold a PP reply.
-        device: the port the bytes came through, as far as known (errors name it; its kind tells the line's speed).
+        device: the port that carried the bytes, if known (for errors; its kind gives the line's speed).
         baud: rate of an RS-232 line in bit/s, 0 for any other.
-        untimed: a scan whose time cannot be told is given its arrival instead of being passed over: the times are known
-            from elsewhere, and what came before the bytes is not.
+        untimed: a scan whose time cannot be determined gets its arrival time instead of being dropped; for callers that
+            have the times from another source.
     """
 
     def __init__(
@@ -54,12 +54,12 @@ class PassiveHokuyo:
         return self._status
 
     def restart(self) -> None:
-        """The bytes that follow belong to another connection (a gap in the recording)."""
+        """Start anew: the next bytes belong to another connection (a gap in the recording)."""
         self._splitter.reset()
         self._stream = None
 
     def feed(self, data: bytes, t_rx: float) -> list[RawScan]:
-        """Take bytes in the order received, with their arrival time; returns the scans they complete."""
+        """Decode bytes in the order received, with their arrival time; returns the scans that they complete."""
         scans: list[RawScan] = []
         dropped = self._splitter.dropped_bytes
         for frame in self._splitter.feed(data):
@@ -92,26 +92,26 @@ class PassiveHokuyo:
         single = reply.echo[:1] in b"GH"
         if reply.status != (ACCEPTED if single else DATA):
             if reply.status == ACCEPTED:
-                self._stream = None  # a stream begins, and the driver knew nothing of older ones either
-            return None  # acknowledgement, refusal, or the sensor checking itself
+                self._stream = None  # a new stream begins; the live driver starts a new clock, too
+            return None  # acknowledgement, refusal, or self-check
         if self._identity is None:
             self._seq += 1
             self._status.invalid += 1
             return None
-        asked = ScanRequest.of_echo(reply.echo)
+        requested = ScanRequest.of_echo(reply.echo)
         stream = self._stream
-        if stream is None or not _same_stream(stream.request, asked):
+        if stream is None or not _same_stream(stream.request, requested):
             speed = line_speed(self._device, self._baud, self._identity.facts)
-            stream = self._stream = ScanStream(self._identity, asked, self._status, speed)
-        stream.request = asked  # a counted stream counts down in its echo
-        scan = stream.take(reply, t_rx, self._seq, self._untimed)
+            stream = self._stream = ScanStream(self._identity, requested, self._status, speed)
+        stream.request = requested  # a counted stream counts down in its echo
+        scan = stream.decode(reply, t_rx, self._seq, self._untimed)
         self._seq += 1
         if scan is None:
             self._status.invalid += 1
         else:
             self._status.scans += 1
             self._status.error = None
-            self._status.dialect = f"SCIP 2 capture {asked.name}"
+            self._status.dialect = f"SCIP 2 capture {requested.name}"
         return scan
 
 

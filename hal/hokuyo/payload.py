@@ -1,11 +1,11 @@
-"""Scan replies of SCIP: what is asked for, and how its payload turns into arrays. Pure, numpy only.
+"""SCIP scan requests and the decoding of their payloads into arrays. Pure, numpy only.
 
 Source: SCIP 2.0 specification C-42-03320B, sections GD/GS/MD/MS; multi-echo and intensity forms as in the supplements
 for UTM-30LX-EW and UXM-30LX-EW (C-42-03907). A payload is cut into lines of 64 characters wherever that falls: values
 straddle lines.
 
-A sum modulo 64 is blind to bits 6 and 7 and to errors that cancel. So each character must also lie in 0x30..0x6F, every
-line but the last must be full, the number of steps must be what was asked for, and the echo must be ours.
+A sum modulo 64 misses bits 6 and 7 and errors that cancel. Each character must therefore also lie in 0x30..0x6F, every
+line but the last must be full, the number of steps must match the request, and the echo must be ours.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _SINGLES: Final = frozenset({"GD", "GS", "GE", "HD", "HE"})
 
 @dataclass(frozen=True, slots=True)
 class ScanRequest:
-    """A scan command and what its replies must look like.
+    """A scan command and the shape of its replies.
 
     Attributes:
         name: MD MS ME ND NE (stream) or GD GS GE HD HE (latest scan once, laser must be on).
@@ -64,7 +64,7 @@ class ScanRequest:
         tag: user string echoed by the sensor.
 
     Raises:
-        ValueError: a field the command line has no room for, or start after end.
+        ValueError: a field out of the range of its digits, or start after end.
     """
 
     name: str
@@ -101,7 +101,7 @@ class ScanRequest:
 
     @property
     def beams(self) -> tuple[int, int]:
-        """Beams a reply may have: implementations drop or keep an incomplete last cluster."""
+        """Least and most beams of a reply: implementations drop or keep an incomplete last cluster."""
         steps = self.end - self.start + 1
         return steps // self.stride, -(-steps // self.stride)
 
@@ -135,9 +135,9 @@ class ScanRequest:
 
     @classmethod
     def of_echo(cls, echo: bytes) -> ScanRequest:
-        """The request behind an echo, for listeners that have not seen what the host said.
+        """The request behind an echo, for captures without the host's commands.
 
-        A counted stream is taken as one that has just begun its last ``remaining + 1`` scans.
+        A counted stream counts as one that has just begun its last ``remaining + 1`` scans.
 
         Raises:
             BadFrame: ECHO, no scan command.
@@ -190,7 +190,7 @@ def parse_scan(request: ScanRequest, reply: Reply) -> ScanReply:
     """Decode a data reply to ``request`` (status 99 of streams, 00 of single scans).
 
     Raises:
-        BadFrame: any rule of the format broken; nothing of a damaged frame is returned.
+        BadFrame: a rule of the format is broken; a damaged frame yields no data.
     """
     if reply.status != (DATA if request.streaming else ACCEPTED):
         raise BadFrame(Flaw.STATUS, f"{reply.status} is no data")
@@ -250,14 +250,14 @@ def _values(sextets: npt.NDArray[np.uint8], chars: int) -> Ints:
 
 
 def _with_echoes(request: ScanRequest, stamp: int, remaining: int, chars: npt.NDArray[np.uint8]) -> ScanReply:
-    """Decode multi-echo payloads: ``&`` says that the next value (or distance and intensity) is of the same step."""
+    """Decode multi-echo payloads: after ``&`` the next value (or distance and intensity) is of the same step."""
     form = request.form
     marks = np.flatnonzero(chars > 0x3F)
     sextets = np.delete(chars, marks)
     if len(sextets) % form.unit:
         raise BadFrame(Flaw.LENGTH, "a value is cut")
     units = len(sextets) // form.unit
-    place = marks - np.arange(len(marks))  # where each & stands once all & are taken out
+    place = marks - np.arange(len(marks))  # position of each & after removal of all &
     extra = np.zeros(units, bool)
     if len(marks):
         unit_of_mark = place // form.unit

@@ -1,8 +1,8 @@
-"""SCIP on the wire: commands out, frames and replies in. Pure functions and small values, no I/O, no clock.
+"""SCIP protocol codec: commands, frames, replies, checksums. Pure functions, no I/O, no clock.
 
 Source: HOKUYO "Communication Protocol Specification for SCIP 2.0 Standard" (C-42-03320B) and the SCIP 2.2 supplements
 of the UST series (C-42-04076). Host lines end in LF; every reply ends in an empty line, so that ``LF LF`` is both the
-delimiter and the mark at which a reader finds its way back after damage. Scan payloads: :mod:`hal.hokuyo.payload`.
+delimiter and the mark at which a reader resynchronises. Scan payloads: :mod:`hal.hokuyo.payload`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ LINE_PAYLOAD: Final = 64
 
 ACCEPTED: Final = "00"
 DATA: Final = "99"
-RESUMED: Final = "98"  # streaming again after the sensor had stopped to check itself
+RESUMED: Final = "98"  # streaming again after a self-check
 LASER_ALREADY_ON: Final = "02"  # of BM; a success
 ABNORMAL: Final = "0L"  # SCIP 2.2: only RB and state queries are accepted
-DENIED: Final = frozenset({"0E", "10"})  # not now: typical of time-adjust mode
+DENIED: Final = frozenset({"0E", "10"})  # refused at present: typical of time-adjust mode
 
 VV: Final = b"VV\n"
 PP: Final = b"PP\n"
@@ -40,11 +40,11 @@ TM_LEAVE: Final = b"TM2\n"
 TO_SCIP2: Final = b"SCIP2.0\n"
 
 BAUD_RATES: Final = (19200, 38400, 57600, 115200, 250000, 500000, 750000)
-"""Rates of RS-232 models, in the order in which a sensor is looked for (factory default first)."""
+"""Rates of RS-232 models, in the order in which they are tried (factory default first)."""
 
 
 class Flaw(Enum):
-    """What made a frame unusable; counted by kind."""
+    """Why a frame is unusable."""
 
     LAYOUT = "lines are missing, cut or of the wrong length"
     STATUS = "no valid status line"
@@ -56,7 +56,7 @@ class Flaw(Enum):
 
 
 class BadFrame(ValueError):
-    """A frame that is not what the protocol allows; ``flaw`` says which rule, the text says where."""
+    """A frame that violates the protocol; ``flaw`` is the broken rule, the text gives the place."""
 
     def __init__(self, flaw: Flaw, detail: str = "") -> None:
         super().__init__(f"{flaw.value}: {detail}" if detail else flaw.value)
@@ -78,7 +78,7 @@ def decode_number(chars: bytes) -> int:
     return value
 
 
-_STATUS = re.compile(rb"[0-9][0-9A-Z]")  # stricter than the sum, which does not see bits 6 and 7
+_STATUS = re.compile(rb"[0-9][0-9A-Z]")  # stricter than the sum, which ignores bits 6 and 7
 _TAG = re.compile(rb"[A-Za-z0-9 ._+@]{0,16}\Z")
 
 
@@ -137,7 +137,7 @@ class FrameSplitter:
         return frames
 
     def reset(self) -> None:
-        """Forget a half-read frame (the stream starts anew)."""
+        """Drop an incomplete frame (a new stream begins)."""
         self.dropped_bytes += len(self._buffer)
         self._buffer.clear()
         self._scan_from = 0
@@ -155,13 +155,13 @@ class FrameSplitter:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """One frame, taken apart as far as all replies are alike.
+    """One frame, split into the parts that all replies have.
 
     Attributes:
         echo: the command line as the sensor repeats it.
         status: two characters; in SCIP 1.1 one (``0`` success, anything else refusal).
         body: the lines after the status, each with its LF; not yet checked.
-        legacy: the status has no checksum: the sensor speaks SCIP 1.1.
+        legacy: the status has no checksum: the sensor uses SCIP 1.1.
     """
 
     echo: bytes
@@ -174,7 +174,7 @@ def parse_reply(frame: bytes) -> Reply:
     """Split a frame and check its status line.
 
     Raises:
-        BadFrame: STATUS where there is none or its sum is wrong.
+        BadFrame: STATUS where it is missing, SUM where its checksum is wrong.
     """
     first = frame.find(b"\n")
     if first < 0:
@@ -204,12 +204,12 @@ def parse_stamp(reply: Reply) -> int:
 def parse_text(reply: Reply, *, strict: bool = True) -> dict[str, str]:
     """``KEY:value;s`` lines of VV, PP and II.
 
-    Firmware disagrees on what is summed: without the ``;`` (the rule), with it, or only up to ``<-``; all three pass.
+    Firmware versions differ in the summed bytes: without the ``;`` (the rule), with it, or up to ``<-``; all are valid.
     A line without a colon is skipped. ``value`` may contain ``;``: the last one ends it.
 
     Args:
         reply: an accepted reply.
-        strict: False takes lines whose sum fits none of the three (the caller has seen the same bytes twice).
+        strict: False accepts lines whose sum fits none of the three (after the same bytes came twice).
 
     Raises:
         BadFrame: SUM, TEXT.

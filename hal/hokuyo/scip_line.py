@@ -1,4 +1,4 @@
-"""An open port seen as SCIP: one question at a time, everything else to whoever follows the stream."""
+"""SCIP over an open port: one command and its reply at a time; all other frames go to the stream's receiver."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hal.hokuyo.scip import DATA, BadFrame, FrameSplitter, Reply, parse_reply
 from hal.port.port import Port
 
 OnFrame = Callable[[bytes, float], None]
-_HEARD: Final = 64
+_FIRST_BYTES: Final = 64
 _SHOWN: Final = 20
 
 
@@ -19,22 +19,22 @@ class Line:
     """Frames in, commands out, over one open port.
 
     Attributes:
-        on_frame: gets every frame that is not the reply being waited for, with its arrival time; None: dropped.
-        recognised: frames with a valid status line so far; tells a right line rate from a wrong one.
-        heard: the first bytes that have come, whatever they were; who empties it gets the next ones.
+        on_frame: receives every frame but the awaited reply, with its arrival time; None: dropped.
+        recognised: frames with a valid status line so far; distinguishes a right line rate from a wrong one.
+        first_bytes: the first bytes received, valid or not; collected anew after it was emptied.
     """
 
     def __init__(self, port: Port) -> None:
         self.port = port
         self.on_frame: OnFrame | None = None
         self.recognised = 0
-        self.heard = b""
+        self.first_bytes = b""
         self._splitter = FrameSplitter()
         self._echo = b""
         self._reply: asyncio.Future[bytes] | None = None
         self._lost: HalError | None = None
         self._on_lost: Callable[[], None] | None = None
-        port.start(self._take, self._gone)
+        port.start(self._receive, self._gone)
 
     @property
     def dropped_bytes(self) -> int:
@@ -42,28 +42,28 @@ class Line:
         return self._splitter.dropped_bytes
 
     @property
-    def strange(self) -> bool:
-        """Whether something talks there and none of it was SCIP."""
-        return bool(self.heard) and not self.recognised
+    def is_foreign(self) -> bool:
+        """Whether bytes arrive and none of them were SCIP."""
+        return bool(self.first_bytes) and not self.recognised
 
     @property
     def lost(self) -> HalError | None:
-        """Why the port is gone; None while it is there."""
+        """The error that ended the port; None while it is open."""
         return self._lost
 
-    def when_lost(self, call: Callable[[], None] | None) -> None:
-        """Have ``call`` called when the port goes, at once if it has gone already; None: nobody."""
+    def set_on_lost(self, call: Callable[[], None] | None) -> None:
+        """Set the callback for the loss of the port, called at once if it is lost already; None removes it."""
         self._on_lost = call
         if call is not None and self._lost is not None:
             call()
 
-    async def ask(self, command: bytes, timeout_s: float) -> bytes:
-        """Send a command and wait for the frame that echoes it; data replies (status 99) are none.
+    async def exchange(self, command: bytes, timeout_s: float) -> bytes:
+        """Send a command and wait for the frame that echoes it; data replies (status 99) do not count.
 
-        A line feed goes first, which ends whatever half a command somebody else has typed.
+        A line feed goes first and ends an incomplete earlier command.
 
         Raises:
-            TimeoutError: no reply. HalError: the port is gone or does not take the command.
+            TimeoutError: no reply. HalError: the port is gone or does not accept the command.
         """
         if self._lost is not None:
             raise self._lost
@@ -81,9 +81,9 @@ class Line:
         self.on_frame = self._on_lost = None
         self.port.close()
 
-    def _take(self, data: bytes, t_rx: float) -> None:
-        if len(self.heard) < _HEARD:
-            self.heard = (self.heard + data)[:_HEARD]
+    def _receive(self, data: bytes, t_rx: float) -> None:
+        if len(self.first_bytes) < _FIRST_BYTES:
+            self.first_bytes = (self.first_bytes + data)[:_FIRST_BYTES]
         for frame in self._splitter.feed(data):
             if self._answers(frame):
                 assert self._reply is not None
@@ -108,12 +108,12 @@ class Line:
 
 
 def printable(data: bytes) -> str:
-    """The beginning of what was heard as a person may read it, a dot for each byte that is no letter."""
+    """The first bytes as readable text, a dot for each unprintable byte."""
     return "".join(chr(one) if 32 <= one < 127 else "." for one in data.strip()[:_SHOWN])
 
 
 def legible(data: bytes) -> float:
-    """Share of bytes that are letters: at a wrong line rate hardly any are."""
+    """Share of printable bytes: at a wrong line rate it is small."""
     return sum(32 <= one < 127 or one in b"\r\n" for one in data) / max(len(data), 1)
 
 
@@ -122,7 +122,7 @@ def _well_formed(frame: bytes) -> bool:
 
 
 def reply_or_none(frame: bytes) -> Reply | None:
-    """The frame taken apart, None where it is damaged."""
+    """The parsed frame; None where it is damaged."""
     try:
         return parse_reply(frame)
     except BadFrame:

@@ -1,10 +1,10 @@
-"""Bring a sensor from whatever state it is in to streaming, and back to silence.
+"""SCIP session: brings a sensor from any state to streaming, and back to idle.
 
-A sensor may be idle, streaming (a serial sensor does not notice that its host has left), in time-adjust mode, still in
-SCIP 1.1, at another line rate, in the middle of a frame, booting, or in its error state. The way through all of them:
+A sensor may be idle, streaming (a serial sensor does not notice the loss of its host), in time-adjust mode, still in
+SCIP 1.1, at another line rate, in the middle of a frame, booting, or in its error state. The steps through all of them:
 
     settle    QT until it is acknowledged; on the way TM2 out of time adjustment, ``SCIP2.0`` out of SCIP 1.1
-    reset     RT or RS, only where something has gone wrong before
+    reset     RT or RS, only after failures
     identify  VV, PP, II
     set_rate  RS-232 only
     start     MD or ME
@@ -23,7 +23,7 @@ from typing import Final
 
 from hal.errors import DataInvalid, DeviceFault, DeviceRefused, HalError
 from hal.hokuyo import scip
-from hal.hokuyo.models import BEFORE_KNOWN, Identity, ModelFacts, identify
+from hal.hokuyo.models import BEFORE_IDENTIFIED, Identity, ModelFacts, identify
 from hal.hokuyo.payload import ScanRequest, parse_scan
 from hal.hokuyo.scip import BadFrame, Reply, parse_reply, parse_text
 from hal.hokuyo.scip_line import Line, OnFrame, legible, printable, reply_or_none
@@ -31,7 +31,7 @@ from hal.hokuyo.scip_line import Line, OnFrame, legible, printable, reply_or_non
 QUIET_S: Final = 0.1
 FIRST_SCAN_S: Final = 6.0  # the motor takes 2 to 5 s to spin up after power-on
 _QT_S: Final = 0.3
-_QT_RS232_S: Final = 1.6  # a frame already on a slow line goes before the reply
+_QT_RS232_S: Final = 1.6  # a frame already on a slow line precedes the reply
 _LISTEN_RS232_S: Final = 0.5
 _LISTEN_19200_S: Final = 1.4
 _TEXT_S: Final = 0.7
@@ -47,11 +47,11 @@ _OTHER_PORT: Final = "name the lidar's own port, and no line rate behind it"
 
 
 class AbnormalState(DeviceFault):
-    """The sensor answers 0L: it obeys nothing but RB."""
+    """The sensor answers 0L: it accepts RB only."""
 
 
 class Session:
-    """One open line and what is known of the sensor behind it.
+    """One open line and the identity of the sensor behind it.
 
     Args:
         line: already started. baud: rate of an RS-232 line, 0 for USB and Ethernet.
@@ -70,15 +70,15 @@ class Session:
 
     @property
     def _facts(self) -> ModelFacts:
-        return BEFORE_KNOWN if self.identity is None else self.identity.facts
+        return BEFORE_IDENTIFIED if self.identity is None else self.identity.facts
 
     # from any state to idle
 
     async def settle(self) -> None:
-        """Make the sensor idle in SCIP 2.x, whatever it is doing.
+        """Make the sensor idle in SCIP 2.x, from any state.
 
         Raises:
-            DeviceFault: nothing answers, or what is no SCIP, or it will not settle. AbnormalState: it reports 0L.
+            DeviceFault: no answer, an answer that is not SCIP, or no idle state. AbnormalState: it reports 0L.
         """
         status = ""
         for _ in range(6):
@@ -100,24 +100,24 @@ class Session:
             reply = await self._try(scip.QT, _QT_RS232_S if self.baud else _QT_S)
             if reply is not None:
                 return reply
-        if self.line.strange:
-            raise self.stranger(self.line.heard)
+        if self.line.is_foreign:
+            raise self.foreign_device(self.line.first_bytes)
         heard = _UNREADABLE if self.line.dropped_bytes else "nothing answers"
         remedy = "is another client connected? it serves one" if self.device.startswith("tcp:") else _NO_ANSWER
         raise DeviceFault(self.device, heard, remedy)
 
-    def stranger(self, heard: bytes) -> DeviceFault:
-        """The error where something talks that is no SCIP sensor; what it says is shown, for a person to know it by.
+    def foreign_device(self, first: bytes) -> DeviceFault:
+        """The error for a device that sends other bytes than SCIP; it quotes them, to help identify the device.
 
-        It stands in the remedy: a problem is logged once for its text, and these bytes are others each time.
+        The bytes stand in the remedy: a problem is logged once per text, and the bytes differ each time.
         """
         other = "name the lidar's own address and port" if self.device.startswith("tcp:") else _OTHER_PORT
         return DeviceFault(
-            self.device, _UNREADABLE, f"something is there that is not SCIP, {printable(heard)!r}: {other}"
+            self.device, _UNREADABLE, f"something is there that is not SCIP, {printable(first)!r}: {other}"
         )
 
     async def find_rate(self, first: int = 0) -> None:
-        """Find the rate of an RS-232 line: ``first``, then every rate SCIP knows.
+        """Find the rate of an RS-232 line: try ``first``, then every SCIP rate.
 
         Raises:
             DeviceFault: no rate gives an answer.
@@ -125,52 +125,52 @@ class Session:
         rates: Sequence[int] = [first, *scip.BAUD_RATES] if first else scip.BAUD_RATES
         strange = b""
         for rate in dict.fromkeys(rates):
-            self.line.heard = b""
+            self.line.first_bytes = b""
             try:
                 self.line.port.set_baud(rate)
-            except DeviceRefused:  # this side cannot do it
+            except DeviceRefused:  # this host does not support it
                 continue
             before = self.line.recognised
             reply = await self._try(scip.QT, _LISTEN_19200_S if rate <= 19200 else _LISTEN_RS232_S)
             if reply is not None or self.line.recognised > before:
                 self.baud = rate
                 return
-            strange = max(strange, self.line.heard, key=legible)
+            strange = max(strange, self.line.first_bytes, key=legible)
         if strange:
-            raise self.stranger(strange)
+            raise self.foreign_device(strange)
         raise DeviceFault(self.device, "nothing answers at any line rate", _NO_ANSWER)
 
     async def reset(self) -> None:
-        """Default speed, clock at zero, laser off; keeps the line rate where the model allows.
+        """Reset: default speed, clock at zero, laser off; keeps the line rate where the model allows.
 
         Raises:
-            DeviceFault: it does not answer twice.
+            DeviceFault: no answer to two commands.
         """
-        command = scip.RT if self._facts.may("RT") else scip.RS
+        command = scip.RT if self._facts.allows("RT") else scip.RS
         for _ in range(2):
             if await self._try(command, _RESET_S) is not None:
                 break
         else:
             raise DeviceFault(self.device, "does not answer a reset", _POWER_CYCLE)
         await asyncio.sleep(_AFTER_RESET_S)
-        if self.baud and command == scip.RS:  # which sets the line rate back as well
+        if self.baud and command == scip.RS:  # RS resets the line rate as well
             await self.find_rate(scip.BAUD_RATES[0])
         await self.settle()
 
     async def reboot(self) -> None:
-        """RB twice within a second; the port is of no use afterwards, open it again."""
+        """Send RB twice within a second; the port must be reopened afterwards."""
         with contextlib.suppress(HalError):
             for _ in range(2):
                 await self._try(scip.RB, 0.3)
             await asyncio.sleep(_AFTER_REBOOT_S)
 
-    # who is it
+    # identification
 
     async def identify(self) -> Identity:
-        """Ask VV, PP and II.
+        """Query VV, PP and II.
 
         Raises:
-            DeviceFault: no readable answer. DeviceRefused: not a sensor this driver can run.
+            DeviceFault: no readable answer. DeviceRefused: a sensor that this driver does not support.
         """
         vv = await self._text(scip.VV)
         pp = await self._text(scip.PP)
@@ -190,9 +190,9 @@ class Session:
             try:
                 reply = parse_reply(frame)
                 if reply.status == scip.ACCEPTED:
-                    return parse_text(reply, strict=frame != seen)  # twice the same: the firmware sums differently
+                    return parse_text(reply, strict=frame != seen)  # same bytes twice: the firmware sums differently
                 problem = f"answer {reply.status}"
-                if reply.status in scip.DENIED:  # some firmware grants QT in time adjustment, and stays there
+                if reply.status in scip.DENIED:  # some firmware accepts QT in time-adjust mode and stays there
                     await self._try(scip.TM_LEAVE, _TEXT_S)
                 await self.settle()
             except BadFrame as error:
@@ -202,11 +202,11 @@ class Session:
     # streaming
 
     async def set_rate(self, baud: int) -> None:
-        """Raise or lower the rate of an RS-232 line; a sensor that refuses stays where it is.
+        """Change the rate of an RS-232 line; a sensor that refuses keeps its rate.
 
         Raises:
-            DeviceRefused: this side cannot do that rate; the sensor has not been asked.
-            DeviceFault: it accepted and is not to be found at the new rate.
+            DeviceRefused: this host does not support the rate; nothing was sent.
+            DeviceFault: the sensor accepted and does not answer at the new rate.
         """
         self.line.port.set_baud(baud)
         self.line.port.set_baud(self.baud)
@@ -223,11 +223,11 @@ class Session:
         raise DeviceFault(self.device, f"lost after changing to {baud} bit/s", remedy)
 
     async def prove(self, request: ScanRequest) -> str:
-        """Ask for a single scan of a mode that not every firmware can do; "" if it came whole, else what was wrong."""
+        """Test a mode that not every firmware supports with a single scan; "" if it is valid, else the problem."""
         once = ScanRequest(request.name, request.start, request.end, request.cluster, 0, 1)
         result: asyncio.Future[str] = asyncio.get_running_loop().create_future()
 
-        def judge(frame: bytes, _t_rx: float) -> None:
+        def check(frame: bytes, _t_rx: float) -> None:
             reply = reply_or_none(frame)
             if reply is None or reply.status != scip.DATA or result.done():
                 return
@@ -239,7 +239,7 @@ class Session:
                 dark = scan.intensity is not None and not scan.intensity.any()
                 result.set_result("every intensity is 0" if dark else "")
 
-        self.line.on_frame = judge
+        self.line.on_frame = check
         try:
             reply = await self._try(once.command(), _ACK_S)
             if reply is not None and reply.status != scip.ACCEPTED:
@@ -256,8 +256,8 @@ class Session:
 
         Args:
             request: an endless one.
-            on_frame: gets the frames.
-            streaming: says whether scans have come, which proves success where the acknowledgement was lost.
+            on_frame: receives the frames.
+            streaming: returns whether scans have arrived, which proves success where the acknowledgement was lost.
 
         Raises:
             DeviceFault, AbnormalState, DeviceRefused: by status.
@@ -278,47 +278,47 @@ class Session:
         return explain_status(self.device, request.name, reply.status, self.health)
 
     async def quiet(self) -> None:
-        """Laser off on the way out, within a tenth of a second; never raises for anything the device does."""
+        """Switch the laser off within 0.1 s; errors of the device are ignored."""
         self.line.on_frame = None
         with contextlib.suppress(HalError, TimeoutError):
-            await self.line.ask(scip.QT, QUIET_S)
+            await self.line.exchange(scip.QT, QUIET_S)
 
     # one exchange
 
     async def _try_frame(self, command: bytes, timeout_s: float) -> bytes | None:
         try:
-            return await self.line.ask(command, timeout_s)
+            return await self.line.exchange(command, timeout_s)
         except TimeoutError:
             return None
 
     async def _try(self, command: bytes, timeout_s: float) -> Reply | None:
-        """Reply, or None where none came or it was damaged."""
+        """The reply; None where none came or it was damaged."""
         frame = await self._try_frame(command, timeout_s)
         return None if frame is None else reply_or_none(frame)
 
     async def _or_lost(self, result: asyncio.Future[str]) -> str:
-        def tell() -> None:
+        def fail() -> None:
             if not result.done() and self.line.lost is not None:
                 result.set_exception(self.line.lost)
 
-        self.line.when_lost(tell)
+        self.line.set_on_lost(fail)
         try:
             return await result
         finally:
-            self.line.when_lost(None)
+            self.line.set_on_lost(None)
 
 
 def explain_status(device: str, command: str, status: str, health: str = "") -> HalError:
-    """The error behind a refusal or a mid-stream status (SCIP 2.0 section 5; 0L, 0M: SCIP 2.2)."""
-    said = f"{command} answers {status}" + (f", state: {health}" if health else "")
+    """The error for a refusal or a mid-stream status (SCIP 2.0 section 5; 0L, 0M: SCIP 2.2)."""
+    text = f"{command} answers {status}" + (f", state: {health}" if health else "")
     if status == scip.ABNORMAL:
-        return AbnormalState(device, f"{said}: error state", _POWER_CYCLE)
+        return AbnormalState(device, f"{text}: error state", _POWER_CYCLE)
     if status in scip.DENIED:
-        return DeviceFault(device, f"{said}: not now (booting, or in another mode)", "it is tried again")
+        return DeviceFault(device, f"{text}: not now (booting, or in another mode)", "it is tried again")
     if status.isdigit() and 50 <= int(status) <= 97:
-        return DeviceFault(device, f"{said}: hardware trouble (laser, motor)", f"{_POWER_CYCLE}; else have it repaired")
+        return DeviceFault(device, f"{text}: hardware trouble (laser, motor)", f"{_POWER_CYCLE}; else have it repaired")
     if status.isdigit() and 21 <= int(status) <= 49:
-        return DeviceFault(device, f"{said}: it is checking itself for a fault", _POWER_CYCLE)
+        return DeviceFault(device, f"{text}: it is checking itself for a fault", _POWER_CYCLE)
     if status in ("01", "02", "03", "04", "05", "06", "07"):
-        return DeviceRefused(device, f"{said}: it does not accept the range it states itself", "report the model")
-    return DeviceFault(device, said, _POWER_CYCLE)
+        return DeviceRefused(device, f"{text}: it does not accept the range it states itself", "report the model")
+    return DeviceFault(device, text, _POWER_CYCLE)

@@ -1,4 +1,4 @@
-"""Data replies of one stream to `RawScan`: codes apart from ranges, stamps to ``t_mono``, losses counted."""
+"""Converts the data replies of one stream to `RawScan`: ranges and codes, ``t_mono`` from stamps, losses counted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hal.hokuyo.scip import Reply
 from hal.hokuyo.ticks import ScanTime, TickClock
 from hal.lidar import VALID, LidarStatus, RawScan
 
-_SATURATED_2CHAR: Final = 4095  # MS and GS say this for everything at least so far
+_SATURATED_2CHAR: Final = 4095  # MS and GS report this for every longer distance
 
 
 class ScanStream:
@@ -21,8 +21,8 @@ class ScanStream:
 
     Args:
         identity: of the sensor.
-        request: what was asked for.
-        status: whose counters are kept (``missed``, ``clock_resets``).
+        request: of the stream.
+        status: its counters ``missed`` and ``clock_resets`` are updated.
         bytes_per_s: speed of the line; part of the time between measurement and arrival.
     """
 
@@ -30,8 +30,8 @@ class ScanStream:
         self.identity = identity
         self.request = request
         self._status = status
-        # data leave at once after the last measurable step, whatever part of the turn was asked for (C-42-03320B);
-        # a UST's wait for the next tick of its millisecond clock is a delay like any other
+        # data leave right after the last measurable step, whatever part of the turn was requested (C-42-03320B);
+        # a UST waits for the next tick of its millisecond clock: one more delay for the envelope
         geometry, turns = identity.geometry, request.skip + 1
         self._clock = TickClock(
             geometry.period_s * turns, geometry.amax / geometry.ares / turns, request.frame_bytes / bytes_per_s
@@ -53,13 +53,13 @@ class ScanStream:
         """Learned time between two scans of the stream, host seconds."""
         return self._clock.period_s
 
-    def take(self, reply: Reply, t_rx: float, seq: int, untimed: bool = False) -> RawScan | None:
-        """Decode and time one data reply; None where its time cannot be told without guessing.
+    def decode(self, reply: Reply, t_rx: float, seq: int, untimed: bool = False) -> RawScan | None:
+        """Decode and time one data reply; None where its time cannot be determined.
 
-        ``untimed``: such a scan is given its arrival for its time, with no end of doubt, for whoever knows better.
+        ``untimed``: such a scan gets its arrival time with infinite uncertainty instead.
 
         Raises:
-            BadFrame: the reply is damaged or of another request.
+            BadFrame: the reply is damaged or belongs to another request.
         """
         data = parse_scan(self.request, reply)
         when = self._clock.feed(data.stamp, t_rx)

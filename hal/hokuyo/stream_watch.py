@@ -1,4 +1,4 @@
-"""Follow a running stream: frames to scans, and a watch over all the ways in which a stream can go wrong."""
+"""Watches a running SCIP stream: frames to scans, and detection of silence, damage, a stuck clock and error status."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _SELF_CHECK_S: Final = 10.0  # a sensor that stopped to verify an error (status 
 _WATCH_CABLE: Final = "check its cable and power; it is restarted by itself"
 
 
-class Follower:
-    """Takes the frames of one stream.
+class StreamWatch:
+    """Receives the frames of one stream and detects its failure.
 
     Args:
-        stream: decodes and times. line: whose port it is. clock: tells how long nothing has come.
-        status: counters and the latest error are kept there. on_scan: gets every valid scan.
+        stream: decodes and times the scans. line: carries the stream. clock: measures silence.
+        status: receives counters and the latest error. on_scan: receives every valid scan.
     """
 
     def __init__(
@@ -46,29 +46,29 @@ class Follower:
 
     @property
     def has_scans(self) -> bool:
-        """True once a valid scan has come."""
+        """True once a valid scan has arrived."""
         return self.scans > 0
 
-    def take(self, frame: bytes, t_rx: float) -> None:
-        """One frame, as the line hands it over."""
+    def receive(self, frame: bytes, t_rx: float) -> None:
+        """Process one frame of the line, with its arrival time."""
         self._note_dropped()
         try:
             reply = parse_reply(frame)
             if reply.status == scip.DATA:
-                self._take_data(reply, t_rx)
+                self._receive_data(reply, t_rx)
             elif reply.echo[:2] == self._stream.request.echo[:2]:
-                self._take_notice(reply)
+                self._receive_notice(reply)
         except BadFrame as error:
             self._reject(str(error))
 
     async def watch(self) -> None:
-        """Return never; raise what ends the stream.
+        """Wait until the stream fails, and raise the cause; never returns.
 
         Raises:
-            DeviceMissing: the port has gone. DeviceFault: silence, a stuck clock, a status of trouble.
-            DataInvalid: frames come, but none is good.
+            DeviceMissing: the port is gone. DeviceFault: silence, a stuck clock, an error status.
+            DataInvalid: frames arrive, but none is valid.
         """
-        self._line.when_lost(self._tell_lost)
+        self._line.set_on_lost(self._end_on_lost)
         try:
             while True:
                 left = self._deadline - self._clock.now()
@@ -78,12 +78,12 @@ class Follower:
                 if self._trouble.done():
                     raise self._trouble.result()
         finally:
-            self._line.when_lost(None)
+            self._line.set_on_lost(None)
 
-    def _take_data(self, reply: Reply, t_rx: float) -> None:
+    def _receive_data(self, reply: Reply, t_rx: float) -> None:
         status = self._status
         seq = status.scans + status.invalid
-        scan = self._stream.take(reply, t_rx, seq)
+        scan = self._stream.decode(reply, t_rx, seq)
         if scan is None:
             self._reject("a stamp that does not continue the sensor's clock")
             if self._stream.stuck:
@@ -96,8 +96,8 @@ class Follower:
         self._deadline = t_rx + max(_PATIENCE_S, _PATIENCE_PERIODS * self._stream.period_s)
         self._on_scan(scan)
 
-    def _take_notice(self, reply: Reply) -> None:
-        """A status inside the stream: acknowledgement, self-check, trouble."""
+    def _receive_notice(self, reply: Reply) -> None:
+        """Process a status inside the stream: acknowledgement, self-check, error."""
         if reply.status in (scip.ACCEPTED, scip.RESUMED, "0B", "0M"):
             return
         if reply.status.isdigit() and 21 <= int(reply.status) <= 49:
@@ -128,7 +128,7 @@ class Follower:
         what = "has fallen silent" if self.scans else f"sends no scan within {FIRST_SCAN_S:g} s"
         return DeviceFault(name, what, _WATCH_CABLE)
 
-    def _tell_lost(self) -> None:
+    def _end_on_lost(self) -> None:
         if self._line.lost is not None:
             self._end(self._line.lost)
 

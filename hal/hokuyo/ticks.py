@@ -1,15 +1,15 @@
-"""From the sensor's 24-bit millisecond stamps to ``t_mono``, without a word to the sensor.
+"""Converts the sensor's 24-bit millisecond stamps to ``t_mono``, passively.
 
 Three stages, each a class:
 
-1. :class:`Unwrapper` decides what a stamp is: the next revolution, a wrap, a repeat, a damaged or restarted clock.
-2. :class:`Revolutions` finds the fraction of the millisecond that the stamp cut off: the motor turns evenly, so a run
-   of whole milliseconds around an uneven period pins it down like a vernier.
+1. :class:`Unwrapper` classifies a stamp: the next revolution, a wrap, a repeat, a damaged or restarted clock.
+2. :class:`Revolutions` recovers the truncated fraction of the millisecond: the motor turns evenly, so that a run of
+   whole milliseconds resolves it like a vernier.
 3. :class:`hal.hokuyo.clock_envelope.Envelope` maps sensor seconds to host seconds by the lower edge of (arrival -
 stamp).
 
-A stamp names the moment the beam passes step 0 (SCIP 2.0, C-42-03320B); because the map is made from the same stamps,
-a constant error of a firmware's stamps cancels, and only the constant way from step 0 to arrival must be known.
+A stamp is the instant at which the beam passes step 0 (SCIP 2.0, C-42-03320B). The map is made from the same stamps, so
+that a constant error of a firmware's stamps cancels. Only the constant delay from step 0 to arrival must be known.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from typing import Final
 from hal.hokuyo.clock_envelope import LAG_S, SLOPE_LIMIT, Envelope
 from hal.hokuyo.scip import TICK_MODULUS
 
-_LEARN_TURNS: Final = 300  # over fewer, the one millisecond of a stamp shows in the period
+_LEARN_TURNS: Final = 300  # over fewer, the resolution of a stamp shows in the period
 _WINDOW_S: Final = 30.0
-_DRIFT_MS: Final = 1.2  # a cut-off fraction is at most 1 ms
+_DRIFT_MS: Final = 1.2  # a truncated fraction is at most 1 ms
 _DRIFT_SCANS: Final = 40
-_ROUGH_SCANS: Final = 10  # by then the period is known better than nominally
+_ROUGH_SCANS: Final = 10  # by then the learned period is better than the nominal one
 _CORRECTED_MS: Final = 0.05
 _SETTLED_SCANS: Final = 20
 _STUCK_REPEATS: Final = 2
 _AHEAD_S: Final = 0.5  # a first scan may have been late by this much when it set the scale
 _AHEAD_SETTLED_S: Final = 0.015
-_EARLY_S: Final = 0.002  # earlier than ever before by this: believed when it happens again and again
-_EARLY_BELIEVED: Final = 2.5  # three times, or a little less often in a longer time
+_EARLY_S: Final = 0.002  # this much earlier than ever before: accepted only when repeated
+_EARLY_BELIEVED: Final = 2.5  # three times in a row, or slightly less often over a longer time
 _RATE_SIGMA: Final = 3e-5
-_NEW_SYNC_S: Final = 20.0  # of silence: the rate is not known well enough to bridge more
+_NEW_SYNC_S: Final = 20.0  # of silence: the rate is too uncertain to bridge more
 
 
 class Verdict(Enum):
-    """What a stamp turned out to be."""
+    """Classification of a stamp."""
 
     GOOD = "good"
     REPEATED = "the same stamp again"
@@ -49,10 +49,10 @@ class Verdict(Enum):
 
 
 class Unwrapper:
-    """24-bit milliseconds to an integer that never wraps, guided by the time of arrival.
+    """Unwraps 24-bit milliseconds to an integer that never wraps, with the help of the arrival time.
 
-    A stamp that does not continue the clock is held back: if the next one continues it, a reset has happened and a new
-    epoch begins there; if the next one fits the old clock, one frame was damaged and nothing has happened.
+    A stamp that does not continue the clock is kept aside. If the next one continues it, the clock was reset and a new
+    epoch begins there. If the next one fits the old clock, a single frame was damaged.
     """
 
     def __init__(self, nominal_ms: float) -> None:
@@ -60,7 +60,7 @@ class Unwrapper:
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything: the next stamp begins an epoch."""
+        """Forget everything; the next stamp begins an epoch."""
         self.last = -1
         self._t_last = 0.0
         self._repeats = 0
@@ -72,14 +72,14 @@ class Unwrapper:
         return self._repeats >= _STUCK_REPEATS
 
     def feed(self, stamp: int, t_rx: float, newest_ms: float, ahead_ms: float, period_ms: float) -> Verdict:
-        """Judge a stamp; on GOOD and RESTARTED :attr:`last` is its unwrapped value.
+        """Classify a stamp; on GOOD and RESTARTED :attr:`last` is its unwrapped value.
 
         Args:
             stamp: 0..2**24-1, ms.
             t_rx: arrival, s.
-            newest_ms: unwrapped stamp of a scan that would arrive now without any delay.
+            newest_ms: unwrapped stamp of a scan that would arrive now without delay.
             ahead_ms: how far past that a stamp may lie.
-            period_ms: learned time between scans on the sensor's clock, 0 while unknown.
+            period_ms: learned time between scans on the sensor's clock, 0 where unknown.
         """
         if self.last < 0:
             return self._accept(stamp, t_rx, Verdict.GOOD)
@@ -90,7 +90,9 @@ class Unwrapper:
         ahead = unwrapped - newest_ms
         step_ms = unwrapped - self.last
         if ahead <= ahead_ms and step_ms > 0:
-            as_long = abs(step_ms - 1000.0 * (t_rx - self._t_last)) < 0.2 * self._nominal_ms  # then the motor changes
+            as_long = (
+                abs(step_ms - 1000.0 * (t_rx - self._t_last)) < 0.2 * self._nominal_ms
+            )  # the motor changes its speed
             if as_long or _whole_revolutions(step_ms, period_ms):
                 return self._accept(unwrapped, t_rx, Verdict.GOOD)
         before, self._doubtful = self._doubtful, (stamp, t_rx)
@@ -111,7 +113,7 @@ class Unwrapper:
 
 
 def _whole_revolutions(step_ms: float, period_ms: float) -> bool:
-    """False where a step of the stamp is no multiple of the period (and not too long to tell)."""
+    """False where a step of the stamp is no multiple of the period; True for steps too long to decide."""
     if period_ms <= 0:
         return True
     turns = round(step_ms / period_ms)
@@ -121,11 +123,11 @@ def _whole_revolutions(step_ms: float, period_ms: float) -> bool:
 
 
 class Revolutions:
-    """Sensor time of each scan in fractional ms, from whole ms and the evenness of the motor.
+    """Sensor time of each scan in fractional ms, from whole ms and the even rotation of the motor.
 
     Attributes:
         exact_ms: of the latest scan. period_ms: learned time between two scans of the stream.
-        correction_ms: by how much the latest stamp has contradicted the run of the motor so far.
+        correction_ms: deviation of the latest stamp from the predicted rotation.
         steady: False while the motor changes its speed, and shortly after.
     """
 
@@ -149,7 +151,7 @@ class Revolutions:
         return self._index >= _SETTLED_SCANS
 
     def feed(self, unwrapped: int) -> int:
-        """Take the next unwrapped stamp; returns how many periods have passed since the one before (0 at the first)."""
+        """Add the next unwrapped stamp; returns the number of periods since the previous one (0 at the first)."""
         if self.exact_ms < 0:
             self.exact_ms = unwrapped + 0.5
             self._anchors.append((0, self.exact_ms))
@@ -164,19 +166,19 @@ class Revolutions:
         return turns
 
     def _judge(self, correction_ms: float, turns: int, step_ms: float) -> None:
-        """Is a contradiction the fraction that stamps cut off, or has the motor changed its speed?"""
+        """Decide whether a deviation is the truncated fraction or a change of the motor's speed."""
         self.correction_ms = 0.0
         if abs(correction_ms) > 2.0 + 0.02 * self.period_ms * turns:
             if 0.3 * self._nominal_ms < step_ms < 3.0 * self._nominal_ms:
                 self.period_ms = step_ms
-            self._learn_anew()
+            self._relearn()
         elif self._index >= (_DRIFT_SCANS if self._changed else _ROUGH_SCANS):
             self._drift_ms += correction_ms - self._drift_ms / _DRIFT_SCANS
             self.correction_ms = correction_ms
             if abs(self._drift_ms) > _DRIFT_MS:
-                self._learn_anew()
+                self._relearn()
 
-    def _learn_anew(self) -> None:
+    def _relearn(self) -> None:
         self._changed = True
         self.steady = False
         self.correction_ms = self._drift_ms = 0.0
@@ -198,7 +200,7 @@ class Revolutions:
 
 @dataclass(frozen=True, slots=True)
 class ScanTime:
-    """When a scan was: ``t_mono`` of step 0, its one-sigma, periods since the scan before (1: none is missing)."""
+    """Time of a scan: ``t_mono`` of step 0, its one-sigma (s), periods since the previous scan (1: none is missing)."""
 
     t_mono: float
     t_sigma: float
@@ -210,9 +212,9 @@ class TickClock:
 
     Args:
         period_s: nominal time between two scans of the stream.
-        sweep: periods from the beam at step 0 to the moment at which the data are complete.
-        line_s: time the bytes of a scan take on the line, undelayed.
-        latency_sigma_s: how well both are known.
+        sweep: periods from the beam at step 0 to the completion of the data.
+        line_s: undelayed transmission time of a scan on the line.
+        latency_sigma_s: one-sigma uncertainty of both.
     """
 
     def __init__(self, period_s: float, sweep: float, line_s: float, latency_sigma_s: float = 2e-4) -> None:
@@ -244,12 +246,12 @@ class TickClock:
         return self._envelope.slope
 
     def restart(self) -> None:
-        """Begin a new epoch: after a reconnect, or when the sensor was reset on purpose."""
+        """Begin a new epoch, after a reconnect or a deliberate reset of the sensor."""
         self._unwrapper.restart()
         self._begin_epoch()
 
     def feed(self, stamp: int, t_rx: float) -> ScanTime | None:
-        """Time a scan by its stamp and arrival; None where no time can be told without guessing (drop the scan)."""
+        """Time a scan by its stamp and arrival; None where the time cannot be determined (drop the scan)."""
         newest_ms, ahead_ms = self._expect(t_rx)
         period_ms = self._revolutions.period_ms if self._revolutions.learned else 0.0
         verdict = self._unwrapper.feed(stamp, t_rx, newest_ms, ahead_ms, period_ms)
@@ -264,7 +266,7 @@ class TickClock:
         delay = t_rx - x - self._sweep * self.period_s
         if abs(self._revolutions.correction_ms) > _CORRECTED_MS:
             self._envelope.shift(-1e-3 * self._revolutions.correction_ms)
-        if self._believable(x, delay):
+        if self._usable(x, delay):
             excess = self._envelope.feed(x, delay)
             if excess < LAG_S:
                 self._excess += (excess - self._excess) / min(self._count + 1, 200)
@@ -274,13 +276,13 @@ class TickClock:
             return None
         self._count += 1
         t_mono = x + self._envelope.delay(x) - self._line_s
-        if not self._t_last < t_mono <= t_rx:  # a scan that has come cannot be yet to come
+        if not self._t_last < t_mono <= t_rx:  # causality: not after the arrival, not before the previous scan
             return None
         self._t_last = t_mono
         return ScanTime(t_mono, self._sigma(x), max(1, periods))
 
-    def _believable(self, x: float, delay: float) -> bool:
-        """False for a delay that says more about a motor in change than about the clocks."""
+    def _usable(self, x: float, delay: float) -> bool:
+        """False for a delay that is dominated by a change of the motor's speed, or is implausibly early."""
         if self._count == 0:
             return True
         early = self._count >= _SETTLED_SCANS and delay < self._envelope.delay(x) - _EARLY_S
@@ -288,7 +290,7 @@ class TickClock:
         return self._revolutions.steady and (not early or self._early > _EARLY_BELIEVED)
 
     def _expect(self, t_rx: float) -> tuple[float, float]:
-        """Newest stamp that could arrive now, and how far past that is still believed; ms."""
+        """Newest stamp that could arrive now, and the tolerance past it; ms."""
         if self._unwrapper.last < 0:
             return 0.0, 0.0
         sweep_s = self._sweep * self.period_s
@@ -311,7 +313,7 @@ class TickClock:
         self._excess = 0.0
 
     def _sigma(self, x: float) -> float:
-        """Cut-off milliseconds, an edge not yet reached or long ago, with the latency's own uncertainty."""
+        """One-sigma of a scan's time, s: truncation, distance from the envelope, age of its last edge, latency."""
         early = 0.01 if self._count < 3 else max(self._excess / math.sqrt(self._count), 5e-3 / self._count)
         fraction = 5e-4 / math.sqrt(min(self._count, 25))
         bridged = _RATE_SIGMA * self._envelope.age(x)

@@ -1,8 +1,8 @@
-"""How much of the loop's time those outside may take: a flood on a port must not keep the loop busy without a pause.
+"""Limits the share of the loop's time that network clients may use, so that a flood on a port cannot delay the cycle.
 
-A loop that is never idle is late for its cycle, and under SCHED_FIFO the kernel takes the processor away from it for
-50 ms of every second that it would otherwise use whole (sched(7), sched_rt_runtime_us). So what serves a socket does so
-for half of each slice of 10 ms at most; the rest of what came waits in the kernel, or is dropped there.
+A loop that is never idle is late for its cycle. Under SCHED_FIFO the kernel also stops a loop that uses a whole second
+of processor time, for 50 ms (sched(7), sched_rt_runtime_us). Socket callbacks therefore run for at most half of each
+slice of 10 ms. Data beyond that wait in the kernel, or are dropped there.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ PART: Final = 0.5
 
 
 class Share:
-    """The time that some callbacks have in common. Call :meth:`begin` and :meth:`end` around each.
+    """A time budget that several callbacks share. Call :meth:`begin` and :meth:`end` around each.
 
     Attributes:
-        held: how often somebody had to wait for the next slice.
+        held: number of callbacks put off to the next slice.
     """
 
     def __init__(self, stopwatch: Callable[[], float] = time.perf_counter) -> None:
@@ -31,7 +31,7 @@ class Share:
         self._spent = 0.0
 
     def begin(self) -> bool:
-        """Whether there is time left; the time of what is done now is taken from it."""
+        """Start a callback: True where the slice has time left, which the callback then uses up."""
         self._begun = now = self._stopwatch()
         if not 0.0 <= now - self._slice < SLICE_S:
             self._slice, self._spent = now, 0.0
@@ -41,7 +41,7 @@ class Share:
         return False
 
     def end(self) -> None:
-        """It is done."""
+        """End the callback: charge its duration to the slice."""
         self._spent += self._stopwatch() - self._begun
 
     def left_s(self) -> float:
@@ -54,10 +54,10 @@ class Share:
 
 
 class Reader:
-    """Calls back when a socket can be read, as long as the share lasts.
+    """Calls back when a socket can be read, as long as its share of the slice lasts.
 
     Args:
-        fd: of the socket. serve: reads what is there, some of it.
+        fd: of the socket. serve: reads some of the waiting data.
     """
 
     def __init__(self, fd: int, serve: Callable[[], None], share: Share) -> None:
@@ -67,7 +67,7 @@ class Reader:
         self._loop.add_reader(fd, self._read)
 
     def close(self) -> None:
-        """Call back no more; idempotent: the number of a closed socket may be another one's by then."""
+        """Stop calling back; idempotent, since the descriptor of a closed socket may already belong to another one."""
         if self._fd < 0:
             return
         self._loop.remove_reader(self._fd)

@@ -1,4 +1,4 @@
-"""Internet addresses and sockets that this computer listens on; errors say what to do."""
+"""Internet addresses and listening sockets: look-up, interfaces, bind errors with their remedies."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import socket
 from functools import partial
 from typing import Any, Final
 
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 
 Address = tuple[socket.AddressFamily, tuple[str, int] | tuple[str, int, int, int]]
@@ -29,7 +29,7 @@ def with_port(address: Address, port: int) -> Address:
 
 
 def _addresses(found: list[Any], index: int = 0) -> list[Address]:
-    """Addresses without repetitions; ``index``: of the interface, where the name had told one."""
+    """Addresses without repetitions; ``index``: of the interface that the host name gave."""
     addresses: list[Address] = []
     for family, _, _, _, (host, port, *more) in found:
         interface = index or (more[1] if more else 0)
@@ -39,12 +39,12 @@ def _addresses(found: list[Any], index: int = 0) -> list[Address]:
 
 
 def _interface(host: str) -> tuple[str, int]:
-    """A host without its interface, and the number of that, 0: none (RFC 4007, 11).
+    """Split a host into its name and the number of its interface, 0: none (RFC 4007, 11).
 
-    The system's own look-up knows interfaces by name only behind addresses of one link, not behind groups of a site.
+    The system's look-up accepts interface names only after link-local addresses, not after site-local groups.
 
     Raises:
-        OSError: there is no such interface (now).
+        OSError: no such interface at present.
     """
     bare, percent, name = host.partition("%")
     if not percent:
@@ -61,25 +61,25 @@ def _interfaces() -> str:
 
 
 def numeric(host: str, port: int, flags: int = 0) -> list[Address]:
-    """Addresses of a numeric host, without any look-up; none where it is a name, or names an interface not there."""
+    """Addresses of a numeric host, without a look-up; none for a name, or for an interface that does not exist."""
     try:
         bare, index = _interface(host)
         flags |= socket.AI_NUMERICHOST
         return _addresses(socket.getaddrinfo(bare or None, port, type=socket.SOCK_DGRAM, flags=flags), index)
-    except (OSError, UnicodeError):  # what getaddrinfo says of names, and of what cannot be one
+    except (OSError, UnicodeError):  # a name, or text that cannot be one
         return []
 
 
 async def resolve(host: str, port: int, *, passive: bool = False) -> list[Address]:
-    """Addresses of a host; a numeric one is never looked up, a name is looked up beside the event loop.
+    """Addresses of a host; a numeric one is never looked up, a name is looked up in a thread.
 
     Args:
         host: name or numeric address; empty with `passive`: every address of this computer.
-        port: goes into the addresses unchanged.
-        passive: whether the addresses are to be listened on.
+        port: copied into the addresses.
+        passive: whether the addresses are for listening.
 
     Raises:
-        DeviceMissing: the name is not known (now) or cannot be one, or there is no such network interface.
+        DeviceMissing: the name is unknown at present or malformed, or there is no such network interface.
     """
     flags = socket.AI_PASSIVE if passive else 0
     if found := numeric(host, port, flags):
@@ -91,7 +91,7 @@ async def resolve(host: str, port: int, *, passive: bool = False) -> list[Addres
         raise DeviceMissing(f"{host}:{port}", problem, f"name one that there is: {_interfaces()}") from error
     look_up = partial(socket.getaddrinfo, host, port, type=socket.SOCK_DGRAM, flags=flags)
     try:
-        return _addresses(await beside(look_up, "names"))
+        return _addresses(await run_in_thread(look_up, "names"))
     except UnicodeError as error:
         remedy = "its labels, between dots, have 1 to 63 characters each"
         raise DeviceMissing(f"{host}:{port}", "not a host name", remedy) from error
@@ -101,7 +101,7 @@ async def resolve(host: str, port: int, *, passive: bool = False) -> list[Addres
 
 
 def listening(address: Address, kind: socket.SocketKind) -> socket.socket:
-    """A bound, non-blocking socket (an IPv6 one takes IPv6 only). Raises OSError, see :func:`refusal`."""
+    """Return a bound, non-blocking socket (an IPv6 one accepts IPv6 only). Raises OSError, see :func:`refusal`."""
     family, where = address
     # asyncio switches Nagle's algorithm off only on sockets that were made with their protocol's number
     protocol = socket.IPPROTO_TCP if kind == socket.SOCK_STREAM else socket.IPPROTO_UDP
@@ -120,13 +120,13 @@ def listening(address: Address, kind: socket.SocketKind) -> socket.socket:
 
 
 def refusal(device: str, option: str, port: int, error: OSError) -> HalError:
-    """The error to raise when a socket cannot be listened on.
+    """The error to raise when a socket cannot be bound.
 
     Args:
-        device: what was to be opened, as a person knows it (``Modbus on 127.0.0.1:1502``).
-        option: configuration key of the port, named in the remedy.
-        port: the number that was asked for.
-        error: what the operating system said.
+        device: the service for the message (``Modbus on 127.0.0.1:1502``).
+        option: configuration key of the port, for the remedy.
+        port: the requested number.
+        error: as the operating system raised it.
     """
     if error.errno == errno.EADDRINUSE:
         return DeviceRefused(device, "the port is in use", f"stop the other program, or choose another {option}")

@@ -1,4 +1,4 @@
-"""Datagrams that bring odometry and IMU readings: bytes to values and back, no sockets.
+"""Codec of the odometry and IMU datagrams: bytes to values and back, no sockets.
 
 Both datagrams are little-endian and end with the CRC-32 (zlib, IEEE 802.3) of everything before it::
 
@@ -65,7 +65,7 @@ def decode(data: bytes) -> InputDatagram:
     """A datagram from its bytes.
 
     Raises:
-        DataInvalid: not such a datagram, another version, damaged, or a value that no robot can have.
+        DataInvalid: not such a datagram, another version, damaged, or a value out of range.
     """
     if len(data) < _HEAD.size + _CRC.size:
         raise DataInvalid(_DEVICE, f"{len(data)} bytes are too short")

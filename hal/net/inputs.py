@@ -1,7 +1,7 @@
-"""Odometry and IMU over UDP: one socket that turns datagrams into readings, whatever the network does to them.
+"""Odometry and IMU over UDP: one socket that turns datagrams into readings.
 
-Lost, repeated and overtaken datagrams, a restarted sender, two senders at once and damaged bytes are told apart and
-counted; none of them makes the pose that is delivered jump. The bytes are in :mod:`hal.net.input_codec`.
+Lost, repeated, reordered and damaged datagrams, a restarted sender and a second sender are distinguished and counted.
+None of them makes the delivered pose jump. The codec is :mod:`hal.net.input_codec`.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from hal.imu import RawImu
 from hal.net import inet
 from hal.net.fair_share import Reader, Share
 from hal.net.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagram, decode
-from hal.net.rx_timestamp import MAX_AGE_S, STAMP_SPACE, kernel_age, stamp_arrivals
+from hal.net.rx_timestamp import MAX_AGE_S, STAMP_SPACE, enable_rx_timestamps, kernel_age
 from hal.net.sender_clock import SenderClock
 from hal.odometry import RawOdometry
 
 log = logging.getLogger(__name__)
 
-SESSION_TIMEOUT_S: Final = 1.0  # another sender is taken when the present one has been silent for this long
+SESSION_TIMEOUT_S: Final = 1.0  # a new sender is accepted after this silence of the current one
 MAX_LEAD_S: Final = 0.001  # a reading cannot be from the future
-CALM_S: Final = 60.0
-"""What is wrong with datagrams is said once, and again when there has been nothing of it for so long."""
+ABSENT_S: Final = 60.0
+"""A problem with datagrams is logged once, and again only after it has been absent for this long."""
 _PER_TURN: Final = 16
 _BUFFER: Final = 256
 
@@ -45,11 +45,11 @@ class Continuity:
         self._begun = False
 
     def restart(self) -> None:
-        """The next pose is from a new origin; what moved in between is not known and is left out."""
+        """The next pose counts from a new origin; the motion in between is unknown and is left out."""
         self._restarted = self._begun
 
-    def follow(self, x: float, y: float, yaw: float) -> tuple[float, float, float]:
-        """The sender's pose in the frame of its first origin."""
+    def transform(self, x: float, y: float, yaw: float) -> tuple[float, float, float]:
+        """Transform the sender's pose (m, m, rad) into the frame of its first origin."""
         if self._restarted:
             turn = self._last[2] - yaw
             c, s = math.cos(turn), math.sin(turn)
@@ -64,31 +64,31 @@ class Continuity:
 
 @dataclass(slots=True)
 class InputCounts:
-    """What came in on one kind of datagram."""
+    """Counters of one kind of datagram."""
 
     received: int = 0
     lost: int = 0
-    late: int = 0  # overtaken by a newer one: dropped, a cumulative pose loses nothing
+    late: int = 0  # arrived after a newer one: dropped, a cumulative pose loses nothing
     duplicate: int = 0
-    foreign: int = 0  # of a second sender while the first still sends
+    foreign: int = 0  # from a second sender while the first still sends
     restarts: int = 0
 
 
 @dataclass(slots=True)
 class Sequence:
-    """Follows the numbering of one sender of one kind of datagram."""
+    """Sequence numbers of one sender of one kind of datagram."""
 
     counts: InputCounts = field(default_factory=InputCounts)
     _session: int | None = None
     _seq: int = 0
-    _heard: float = -math.inf
+    _t_latest: float = -math.inf
     restarted: bool = False
 
     def accept(self, session: int, seq: int, t_rx: float) -> bool:
-        """Whether a datagram is the next news; `restarted` says whether its sender began anew."""
+        """Return whether a datagram is new and from the current sender; sets `restarted` where its sender restarted."""
         self.restarted = False
         if session != self._session:
-            if t_rx - self._heard <= SESSION_TIMEOUT_S:
+            if t_rx - self._t_latest <= SESSION_TIMEOUT_S:
                 self.counts.foreign += 1
                 return False
             self.restarted = self._session is not None
@@ -98,35 +98,35 @@ class Sequence:
             if ahead == 0:
                 self.counts.duplicate += 1
                 return False
-            self.restarted = ahead >= 1 << 31 and t_rx - self._heard > SESSION_TIMEOUT_S
-            if self.restarted:  # a sender that starts anew under the same session number
+            self.restarted = ahead >= 1 << 31 and t_rx - self._t_latest > SESSION_TIMEOUT_S
+            if self.restarted:  # a restarted sender with the same session number
                 self.counts.restarts += 1
             elif ahead >= 1 << 31:
                 self.counts.late += 1
                 return False
             else:
                 self.counts.lost += ahead - 1
-        self._session, self._seq, self._heard = session, seq, t_rx
+        self._session, self._seq, self._t_latest = session, seq, t_rx
         self.counts.received += 1
         return True
 
 
 @dataclass(slots=True)
 class _Trouble:
-    """Something wrong with datagrams that is worth a line of the log when it lasts."""
+    """A recurring problem with datagrams, logged once it persists."""
 
     begun: float = -math.inf
     latest: float = -math.inf
-    said: bool = False
+    logged: bool = False
 
-    def lasts(self, t: float) -> bool:
-        """Once more at ``t``: is it to be said now? One damaged datagram, or a sender's quick restart, is not."""
-        if t - self.latest > CALM_S:
-            self.begun, self.said = t, False
+    def to_log(self, t: float) -> bool:
+        """Count an occurrence at ``t`` (s); return True when it has persisted long enough to be logged."""
+        if t - self.latest > ABSENT_S:
+            self.begun, self.logged = t, False
         self.latest = t
-        if self.said or t - self.begun <= SESSION_TIMEOUT_S:
+        if self.logged or t - self.begun <= SESSION_TIMEOUT_S:
             return False
-        self.said = True
+        self.logged = True
         return True
 
 
@@ -136,15 +136,15 @@ Allowed = Callable[[str], bool]
 
 
 class InputPort:
-    """One UDP port that takes both kinds of datagrams; `odometry` and `imu` are its two sources.
+    """One UDP port for both kinds of datagrams; `odometry` and `imu` are its two sources.
 
-    The socket is open while at least one source runs. A datagram's time of arrival is the kernel's.
+    The socket is open while at least one source runs. Arrival times are the kernel's receive timestamps.
 
     Args:
         bind: name or address of this computer; empty: all of them.
-        port: 0: any free one, told by :attr:`port` once open.
+        port: 0: any free one, see :attr:`port` once open.
         option: configuration key of the port, for the remedy.
-        allowed: whether a host's datagrams are taken.
+        allowed: returns whether datagrams of a host are accepted.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class InputPort:
         return {"odometry": self._kinds[ODOMETRY_MAGIC].counts, "imu": self._kinds[IMU_MAGIC].counts}
 
     async def open(self) -> None:
-        """Listen; each call is undone by one `close`.
+        """Open the sockets; each call needs one `close`.
 
         Raises:
             DeviceRefused: port in use, or not permitted. DeviceMissing: no such address here.
@@ -201,7 +201,7 @@ class InputPort:
     def _listen(self, address: inet.Address) -> None:
         sock = inet.listening(inet.with_port(address, self.port), socket.SOCK_DGRAM)
         self._sockets.append(sock)
-        stamp_arrivals(sock)
+        enable_rx_timestamps(sock)
         self._readers.append(Reader(sock.fileno(), partial(self._read, sock), self._share))
 
     def close(self) -> None:
@@ -225,23 +225,23 @@ class InputPort:
             except OSError:  # nothing more
                 return
             if self._allowed is None or self._allowed(peer[0]):
-                self.take(data, self._clock.now() - kernel_age(ancillary), str(peer[0]))
+                self.receive(data, self._clock.now() - kernel_age(ancillary), str(peer[0]))
 
-    def take(self, data: bytes, t_rx: float, peer: str = "a sender") -> None:
-        """One datagram, its time of arrival, and whose it is (also for replay)."""
+    def receive(self, data: bytes, t_rx: float, peer: str = "a sender") -> None:
+        """Decode, check and deliver one datagram; ``t_rx``: its arrival (s). Replay calls it directly."""
         try:
             datagram = decode(data)
         except DataInvalid as error:
             self.invalid += 1
-            if self._damage.lasts(t_rx):
+            if self._damage.to_log(t_rx):
                 log.info("port %d: what %s sends is no reading: %s", self.port, peer, error)
             return
         kind = self._kinds[datagram.magic]
         lost, foreign = kind.counts.lost, kind.counts.foreign
         if not kind.accept(datagram.session, datagram.seq, t_rx):
-            if kind.counts.foreign > foreign and self._rivals[datagram.magic].lasts(t_rx):
-                said = "port %d: readings of %s are ignored while another sender is heard there (end one of them)"
-                log.warning(said, self.port, peer)
+            if kind.counts.foreign > foreign and self._rivals[datagram.magic].to_log(t_rx):
+                text = "port %d: readings of %s are ignored while another sender is heard there (end one of them)"
+                log.warning(text, self.port, peer)
             return
         t_mono = self._reading_time(datagram, t_rx, kind.restarted)
         if datagram.magic == IMU_MAGIC:
@@ -250,26 +250,26 @@ class InputPort:
             return
         if kind.restarted:
             self._continuity.restart()
-        x, y, yaw = self._continuity.follow(*datagram.values)
+        x, y, yaw = self._continuity.transform(*datagram.values)
         if self._on_odometry is not None:
             missed = kind.counts.lost - lost
             self._on_odometry(RawOdometry(t_rx=t_rx, t_mono=t_mono, x=x, y=y, yaw=yaw, missed=missed))
 
     def _reading_time(self, datagram: InputDatagram, t_rx: float, restarted: bool) -> float:
-        """When the reading was true: by the sender's clock, ours if it says so and is plausible, or by the arrival."""
+        """``t_mono`` of a reading: the shared clock where flagged and plausible, else from sender clock and arrival."""
         if not datagram.flags & SHARED_CLOCK:
             clock = self._clocks[datagram.magic]
             if restarted:
                 clock.restart()
-            return clock.when(datagram.time, t_rx)
+            return clock.measured_at(datagram.time, t_rx)
         return min(datagram.time, t_rx) if -MAX_LEAD_S <= t_rx - datagram.time <= MAX_AGE_S else t_rx
 
     def send_odometry_to(self, receiver: OnOdometry | None) -> None:
-        """Who gets odometry readings."""
+        """Set the receiver of odometry readings; None: no receiver."""
         self._on_odometry = receiver
 
     def send_imu_to(self, receiver: OnImu | None) -> None:
-        """Who gets gyro readings."""
+        """Set the receiver of gyro readings; None: no receiver."""
         self._on_imu = receiver
 
 

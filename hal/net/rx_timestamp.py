@@ -1,4 +1,4 @@
-"""When the kernel received a datagram: a loop that is late for it makes no reading late."""
+"""Kernel receive timestamps of datagrams (SO_TIMESTAMPNS): arrival times do not depend on the loop's delay."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import time
 from typing import Any, Final
 
 MAX_AGE_S: Final = 1.0
-"""An older stamp is not believed."""
+"""An older timestamp is ignored."""
 _TIMESPEC: Final = struct.Struct("@ll")
 _SO_TIMESTAMPNS: Final = 35  # asm-generic/socket.h; the socket module has no name for it
 STAMP_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
-"""Ancillary bytes to ask `recvmsg` for."""
+"""Size of the ancillary buffer for `recvmsg`, bytes."""
 
 
-def stamp_arrivals(sock: socket.socket) -> None:
-    """Have the kernel stamp what a socket receives; without a word where it cannot."""
-    with contextlib.suppress(OSError):  # a kernel without it: the time of reading is used
+def enable_rx_timestamps(sock: socket.socket) -> None:
+    """Enable kernel timestamps on a socket; does nothing where the kernel has none."""
+    with contextlib.suppress(OSError):  # without it the time of reading is used
         sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
 
 def kernel_age(ancillary: list[tuple[int, int, Any]]) -> float:
-    """Seconds since the kernel received a datagram; 0 where it does not say, or its clock was set in between."""
+    """Seconds since the kernel received a datagram; 0 without a timestamp, or where the clock was set in between."""
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(data) >= _TIMESPEC.size:
             seconds, nanoseconds = _TIMESPEC.unpack_from(data)

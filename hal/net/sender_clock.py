@@ -1,4 +1,4 @@
-"""When a reading of another computer was true: its own clock tells which readings the network has held up."""
+"""Measurement time of a remote reading: the sender's clock shows which readings the network has held up."""
 
 from __future__ import annotations
 
@@ -8,43 +8,43 @@ from typing import Final
 from hal.net.rx_timestamp import MAX_AGE_S
 
 FEWEST: Final = 20
-"""Readings of which it is learned how long is usual between two; before, none is dated back."""
+"""Readings from which the usual interval is learned; before that none is dated back."""
 LEARN: Final = 1.0 / FEWEST
-"""Share of every later one in that."""
+"""Weight of each later reading in the usual interval."""
 GAP: Final = 1.5
-"""So many times the usual time between two arrivals is a gap."""
+"""An arrival interval of this many usual intervals is a gap."""
 REGULAR: Final = 0.5
-"""What the sender's clock has to have gone on by meanwhile, of that time, to be believed: it may have stood."""
+"""Least advance of the sender's clock during a gap, in usual intervals; a smaller one means that the clock stood."""
 LASTS_S: Final = 0.3
-"""What still lags so long after a gap is the way of the data, or the clock."""
+"""A lag that lasts this long after a gap is a change of the route or of the clock, not a hold-up."""
 
 
 class SenderClock:
-    """Follows one sender: arrivals, and the time that its clock gives with each reading.
+    """Arrival times and clock readings of one sender.
 
-    Where nothing comes for longer than usual though the clock has gone on as usual, the reading that comes at last has
-    been held up by the difference, and those that come with it by less each. That much they are dated back; all others
-    are as old as their arrival says. No clock has to be right for that, or fine: only what it does during a gap counts.
+    A gap in the arrivals during which the sender's clock ran on as usual is a hold-up: the first reading after it is
+    late by the difference, each following one by less. These readings are dated back by their lateness; all others
+    keep their arrival time. The sender's clock needs neither offset nor rate: only its advance during a gap counts.
     """
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
-        """Another sender, or another clock."""
+        """Forget everything: another sender, or another clock."""
         self._t = self._t_gap = -math.inf
         self._time = -math.inf
         self._held = self._usual = 0.0
         self._count = 0
 
-    def when(self, time: float, t_rx: float) -> float:
-        """The instant of a reading on this computer's clock, s: ``t_rx`` at the latest, `MAX_AGE_S` before at most.
+    def measured_at(self, time: float, t_rx: float) -> float:
+        """Time of a reading on this computer's clock, s: between ``t_rx - MAX_AGE_S`` and ``t_rx``.
 
-        Unless arrivals go back it is never before that of the reading before.
+        It never decreases as long as the arrival times do not.
 
         Args:
-            time: of the reading by the sender's clock, s, finite.
-            t_rx: of its arrival, on this computer's, s; how long was waited since counts from the latest so far.
+            time: the sender's clock at the reading, s, finite.
+            t_rx: arrival on this computer's clock, s. Intervals count from the latest arrival so far.
         """
         if time <= self._time:
             self.restart()
@@ -63,5 +63,7 @@ class SenderClock:
             self._held = max(0.0, self._held + min(later, 0.0))
         if arrived - self._t_gap > LASTS_S:
             self._held = 0.0
-        most = waited if self._count < FEWEST else min(waited, 4.0 * self._usual)  # a silence is not what is usual
+        most = (
+            waited if self._count < FEWEST else min(waited, 4.0 * self._usual)
+        )  # a long silence must not stretch the usual interval
         self._usual += (most - self._usual) * max(LEARN, 1.0 / self._count)

@@ -1,1 +1,1 @@
-"""Photodiode receivers: I2C converters that are read in uniform blocks, and one that tells dark from dazzled."""
+"""The light receiver: I2C converters read in uniform sample blocks, and a DC channel for the mean light level."""

@@ -1,8 +1,8 @@
-"""What an adapter can do: how long a read it carries through without a pause, and at which SCL.
+"""Measures an I2C adapter: the longest read without a pause, and the SCL frequency.
 
-Lengths are tried upwards, so that an adapter is never asked for far more than it can do (some need a time-out to find
-that out, and the transaction after it fails as well). A length is good when it comes without an error and takes no
-longer than theory: adapters behind USB read in pieces and let SCL rest between them.
+Lengths are tried upwards, so that a request never exceeds the adapter's limit by much. (Some adapters then need a
+time-out, and the next transaction fails as well.) A length is good when the read succeeds and takes no longer than
+theory. USB adapters read in pieces and stop SCL between them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LENGTHS: Final = (60, 512, 2048, MAX_LENGTH)
 _REPEATS: Final = {SHORT: 16, 60: 8, 512: 5}
 _REPEATS_LONG: Final = 3
 _PAUSE: Final = 0.03
-"""Longer than theory by more than this share: the adapter pauses inside."""
+"""A read that exceeds theory by more than this share contains a pause."""
 _UNFIT: Final = {
     "i2c-gpio": "the processor clocks this bus bit by bit, and is interrupted",
     "FT260": "USB: it reads 60 bytes at a time and pauses",
@@ -30,7 +30,7 @@ _UNFIT: Final = {
     "CP2112": "USB: it reads 61 bytes at a time and pauses",
     "CH341": "USB: it reads 32 bytes at a time and pauses",
 }
-"""Adapters by a part of their names, whose samples are not evenly spaced: good for levels, not for decoding lights."""
+"""Adapters, by a part of their names, with unevenly spaced samples: usable for levels, not for decoding lights."""
 _LIMITS: Final = frozenset({errno.EOPNOTSUPP, errno.EINVAL, errno.ETIMEDOUT, errno.EIO, errno.EPROTO})
 _PASSING: Final = frozenset({errno.ENXIO, errno.EREMOTEIO, errno.EAGAIN, errno.EIO})
 _FAILURES: Final = 3
@@ -39,13 +39,13 @@ _SCL_HZ: Final = (10e3, 5e6)
 
 
 @dataclass(frozen=True, slots=True)
-class Capability:
-    """What was found.
+class AdapterLimits:
+    """Measured limits of an adapter.
 
     Attributes:
         length: bytes of the blocks to read. span_s, short_s: shortest read of that length, and of 2 bytes.
-        spread_s: by how much a 2-byte read is longer than the shortest, median.
-        limit: why blocks are shorter than wanted, or not even; empty if they are neither.
+        spread_s: median excess of a 2-byte read over the shortest one.
+        limit: why blocks are shorter than wanted or unevenly sampled; empty where neither holds.
     """
 
     length: int
@@ -56,12 +56,12 @@ class Capability:
 
     @property
     def scl_hz(self) -> float:
-        """SCL frequency as measured."""
+        """Measured SCL frequency."""
         return scl_hz(self.length, self.span_s, self.short_s)
 
 
 async def _spans(bus: AsyncBus, address: int, length: int) -> list[float]:
-    """Spans of several reads, the shortest first; raises `OSError` if one fails again and again."""
+    """Durations of several reads (s), the shortest first; raises `OSError` where one fails repeatedly."""
     spans: list[float] = []
     failures = 0
     while len(spans) < _REPEATS.get(length, _REPEATS_LONG):
@@ -79,15 +79,15 @@ async def _spans(bus: AsyncBus, address: int, length: int) -> list[float]:
     return sorted(spans)
 
 
-async def measure(bus: AsyncBus, address: int, block_s: float) -> Capability:
-    """Find the longest read up to ``block_s`` seconds that comes through without a pause.
+async def measure(bus: AsyncBus, address: int, block_s: float) -> AdapterLimits:
+    """Find the longest read up to ``block_s`` seconds without a pause.
 
     Raises:
-        OSError: already short reads fail. DeviceRefused: the adapter cannot even read 60 bytes in one go.
+        OSError: short reads fail. DeviceRefused: the adapter cannot read 60 bytes in one transaction.
     """
     shorts = await _spans(bus, address, SHORT)
     short_s, spread_s = shorts[0], median(shorts) - shorts[0]
-    found: Capability | None = None
+    found: AdapterLimits | None = None
     limit = ""
     for length in LENGTHS:
         if found is not None:
@@ -107,7 +107,7 @@ async def measure(bus: AsyncBus, address: int, block_s: float) -> Capability:
     wanted = min(_wanted(block_s, found.scl_hz), MAX_LENGTH)
     shorter = limit if found.length < wanted else ""
     unfit = next((why for name, why in _UNFIT.items() if name in bus.about), "")
-    return Capability(found.length, found.span_s, short_s, spread_s, "; ".join(filter(None, (unfit, shorter))))
+    return AdapterLimits(found.length, found.span_s, short_s, spread_s, "; ".join(filter(None, (unfit, shorter))))
 
 
 def _wanted(block_s: float, hz: float) -> int:
@@ -116,17 +116,17 @@ def _wanted(block_s: float, hz: float) -> int:
 
 
 async def _try(
-    bus: AsyncBus, address: int, length: int, short_s: float, before: Capability | None
-) -> tuple[Capability | None, str]:
-    """One length: what it shows, or None and why it is too long."""
+    bus: AsyncBus, address: int, length: int, short_s: float, before: AdapterLimits | None
+) -> tuple[AdapterLimits | None, str]:
+    """Measure one length: its limits, or None and why it is too long."""
     try:
         span, *_ = await _spans(bus, address, length)
     except OSError as error:
         if error.errno not in _LIMITS:
             raise
-        await _calm(bus, address)
+        await _send_stop(bus, address)
         return None, f"{length} bytes: {os.strerror(error.errno or 0)}"
-    tried = Capability(length, span, short_s)
+    tried = AdapterLimits(length, span, short_s)
     if not _SCL_HZ[0] < tried.scl_hz < _SCL_HZ[1]:
         return None, f"{length} bytes in {1e3 * span:.2f} ms, 2 bytes in {1e3 * short_s:.2f} ms"
     if before is not None and tried.scl_hz < (1.0 - _PAUSE) * before.scl_hz:
@@ -134,8 +134,8 @@ async def _try(
     return tried, ""
 
 
-async def _calm(bus: AsyncBus, address: int) -> None:
-    """A short read after a failed long one: it makes a STOP, and may itself fail once."""
+async def _send_stop(bus: AsyncBus, address: int) -> None:
+    """Make a short read after a failed long one: it sends a STOP, and may itself fail once."""
     for _ in range(2):
         try:
             await bus.transfer((read(address, SHORT),))

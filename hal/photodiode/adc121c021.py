@@ -1,7 +1,7 @@
-"""ADC121C021 and ADC121C027: 12 bits, one input, registers behind a pointer (Texas Instruments SNAS415).
+"""The ADC121C021 and ADC121C027 converters: 12 bits, one input, registers behind a pointer (TI SNAS415).
 
-The first byte of a write sets the pointer, which stays; with the pointer at the conversion result, reading in normal
-mode (automatic conversion off) starts a conversion, and acknowledging on delivers the next one in the next two bytes.
+The first byte of a write sets the pointer, which then stays. With the pointer at the conversion result, a read in
+normal mode (automatic conversion off) starts a conversion; each further acknowledged pair of bytes is the next one.
 A result word is the alert flag (0 while alerts are disabled), three zeros, D11..D0.
 """
 
@@ -32,8 +32,8 @@ _NORMAL_MODE: Final = bytes([Register.CONFIGURATION, 0])
 _SELECT_CONVERSION: Final = bytes([Register.CONVERSION])
 
 
-def judge(answers: tuple[bytes | None, ...]) -> str:
-    """Its registers can be read and have their reserved bits at zero; anything else is another chip."""
+def mismatch(answers: tuple[bytes | None, ...]) -> str:
+    """Text where the registers cannot be read or have reserved bits set: then it is another chip."""
     if any(answer is None for answer in answers):
         return "has no registers, an ADC121C021 has eight"
     configuration, *limits = [int.from_bytes(answer or b"", "big") for answer in answers]
@@ -56,11 +56,11 @@ def _chip(name: str, addresses: set[int]) -> BlockChip:
             Query(bytes([Register.CONFIGURATION]), 1),
             *(Query(bytes([register]), 2) for register in _LIMITS),
         ),
-        judge=judge,
+        mismatch=mismatch,
         setup=(_NORMAL_MODE, _SELECT_CONVERSION),
     )
 
 
 ADC121C021: Final = _chip("ADC121C021", {0x50, 0x51, 0x52, 0x54, 0x55, 0x56, 0x58, 0x59, 0x5A})
-"""In SOT always at 0x54, in VSSOP by two pins."""
+"""SOT package: always 0x54; VSSOP: set by two pins."""
 ADC121C027: Final = _chip("ADC121C027", {0x50, 0x51, 0x52})

@@ -1,8 +1,8 @@
-"""ADS1015 and ADS1115: delta-sigma converters with an oscillator of their own (Texas Instruments SBAS473, SBAS444).
+"""The ADS1015 and ADS1115 converters: delta-sigma, with an oscillator of their own (TI SBAS473, SBAS444).
 
-Here they only tell a level: data rates are good to 10 %, and reading faster repeats the latest result. Four 16-bit
-registers behind a pointer that stays: conversion, configuration, low and high threshold. Results are two's complement
-with full scale at 32768; the ADS1015 leaves the lowest four bits at zero.
+They serve the DC channel only: data rates are accurate to 10 %, and a faster read repeats the latest result. Four
+16-bit registers lie behind a pointer that stays: conversion, configuration, low and high threshold. Results are two's
+complement with full scale at 32768; the ADS1015 leaves the lowest four bits at zero.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Configuration:
 
     Attributes:
         channel: AIN0 to AIN3 against ground. pga: index into :data:`RANGES_V`. rate: DR code.
-        single: convert once when told to (the state after reset); else continuously.
+        single: convert once per start bit (the state after reset); else continuously.
         start: with ``single``, start a conversion by this write.
     """
 
@@ -65,7 +65,7 @@ class Configuration:
         return fields | (self.single << 8) | (self.rate << 5) | 0b00011
 
     def message(self) -> bytes:
-        """What is written to the chip: pointer and word."""
+        """The bytes of the write: pointer and word."""
         return struct.pack(">BH", Register.CONFIGURATION, self.word())
 
     @property
@@ -75,12 +75,12 @@ class Configuration:
 
 
 def same_configuration(answer: bytes, wanted: Configuration) -> bool:
-    """Whether the chip has taken a configuration; bit 15 says something else when read (idle or converting)."""
+    """Whether the chip has the configuration; bit 15 has another meaning when read (idle or converting)."""
     return len(answer) == 2 and (int.from_bytes(answer, "big") ^ wanted.word()) & ~_IDLE == 0
 
 
-def judge(answers: tuple[bytes | None, ...]) -> str:
-    """Thresholds as after reset, or as for a conversion-ready pin; anything else may be another kind of chip."""
+def mismatch(answers: tuple[bytes | None, ...]) -> str:
+    """Text where the thresholds are neither those after reset nor those of a conversion-ready pin."""
     if any(answer is None for answer in answers):
         return "has no registers, an ADS1x15 has four"
     low, high = (int.from_bytes(answer or b"", "big") for answer in answers)

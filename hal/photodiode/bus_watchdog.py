@@ -1,4 +1,4 @@
-"""A bus that is listened to: silence shows after five blocks, whatever it is that keeps quiet."""
+"""A watchdog around an I2C bus: reports silence after five blocks, and a transaction that hangs."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from hal.errors import DeviceFault, HalError
 
 BLOCKS: Final = 5
 FLOOR_S: Final = 0.1
-"""Silence is not told before this, however short the blocks are."""
+"""Silence is not reported before this, however short the blocks are."""
 HANG_S: Final = 3.0
-"""Without any transaction coming back for this long, one hangs in the kernel: whatever can time out has done so."""
+"""A transaction that has not returned for this long hangs in the kernel: every time-out has passed."""
 
 Explain = Callable[[OSError], HalError]
 OnSilence = Callable[[HalError, bool], None]
-"""What is wrong, and whether that is certain: a first silence may be over before anybody needs to read of it."""
+"""Called with the error, and whether it is certain: a first silence may end before it needs a log line."""
 
 
 class WatchedBus:
@@ -27,7 +27,7 @@ class WatchedBus:
 
     Args:
         bus: the other. block_s: length of blocks.
-        explain: what an error of a transaction means. on_silence: told of silence and of its cause.
+        explain: converts a transaction's error. on_silence: called for silence and for its cause.
     """
 
     def __init__(self, bus: AsyncBus, block_s: float, explain: Explain, on_silence: OnSilence) -> None:
@@ -36,8 +36,8 @@ class WatchedBus:
         self._loop = asyncio.get_running_loop()
         self._t_read = self._t_back = self._loop.time()
         self._failure: OSError | None = None
-        self._heard = asyncio.Event()
-        self._heard.set()
+        self._active = asyncio.Event()
+        self._active.set()
 
     @property
     def name(self) -> str:
@@ -54,19 +54,19 @@ class WatchedBus:
         try:
             done = await self._bus.transfer(messages)
         except OSError as error:
-            if error.errno in NACKS and messages[0].data:  # a chip without registers says so in this way
-                self._came_back()
+            if error.errno in NACKS and messages[0].data:  # a chip without registers does not acknowledge
+                self._returned()
             else:
                 self._failed(error)
             raise
-        self._came_back()
+        self._returned()
         return done
 
     async def stream(self, messages: tuple[Message, ...], on_read: OnRead) -> None:
         """Repeat one transaction until cancelled; raises `OSError`."""
 
         def pass_on(done: Transferred, dropped: int) -> None:
-            self._came_back()
+            self._returned()
             on_read(done, dropped)
 
         try:
@@ -79,46 +79,46 @@ class WatchedBus:
         """Close; idempotent."""
         await self._bus.close()
 
-    async def listen(self) -> None:
-        """Tell of silence until cancelled."""
+    async def watch(self) -> None:
+        """Report silence until cancelled."""
         while True:
             left = self._t_read + self._patience_s - self._loop.time()
             if left > 0.0:
                 await asyncio.sleep(left)
                 continue
-            self._heard.clear()
+            self._active.clear()
             failure = self._failure
-            self._on_silence(self._explain(failure) if failure else self._say_silent(), failure is not None)
-            await self._until_heard()
+            self._on_silence(self._explain(failure) if failure else self._silent_error(), failure is not None)
+            await self._until_active()
 
-    async def _until_heard(self) -> None:
+    async def _until_active(self) -> None:
         hangs = False
-        while not self._heard.is_set():
+        while not self._active.is_set():
             left = self._t_back + HANG_S - self._loop.time()
             if left <= 0.0 and not hangs:
                 hangs = True
-                self._on_silence(self._say_hang(), True)
+                self._on_silence(self._hang_error(), True)
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._heard.wait(), None if hangs else left)
+                await asyncio.wait_for(self._active.wait(), None if hangs else left)
 
-    def _came_back(self) -> None:
+    def _returned(self) -> None:
         self._t_read = self._t_back = self._loop.time()
         self._failure = None
-        self._heard.set()
+        self._active.set()
 
     def _failed(self, error: OSError) -> None:
         self._t_back, self._failure = self._loop.time(), error
-        if not self._heard.is_set():
+        if not self._active.is_set():
             self._on_silence(self._explain(error), True)
 
-    def _say_silent(self) -> HalError:
+    def _silent_error(self) -> HalError:
         return DeviceFault(
             self.name,
             f"nothing has been read for {BLOCKS} blocks",
             "it is tried again by itself; if that lasts, look at the wiring and into the kernel log",
         )
 
-    def _say_hang(self) -> HalError:
+    def _hang_error(self) -> HalError:
         return BusStuck(
             self.name,
             f"a transaction has not returned for {HANG_S:g} s",

@@ -1,4 +1,4 @@
-"""What the sampler has to know of a converter, and the converters there are."""
+"""Descriptions of the supported converters, and their look-up by name."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ CLOCKS_AROUND: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """A register to be read: ``select`` is written, then ``length`` bytes are read."""
+    """A register read: ``select`` is written, then ``length`` bytes are read."""
 
     select: bytes
     length: int
 
 
-Judge = Callable[[tuple[bytes | None, ...]], str]
-"""Answers to the queries (None: not acknowledged) to what speaks against this chip; empty if nothing does."""
+Mismatch = Callable[[tuple[bytes | None, ...]], str]
+"""Maps the replies to the queries (None: not acknowledged) to why it is another chip; empty where it is this one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +32,9 @@ class BlockChip:
     """A converter whose conversions are clocked by SCL, so that one long read is one uniform block.
 
     Attributes:
-        addresses: 7-bit addresses it can have. bits: of a conversion, straight binary, full scale is the supply.
-        spare: mask of the bits of a word that are always 0. scl_max_hz: fastest SCL its data sheet allows.
-        queries, judge: how to find out whether it is this chip. setup: messages that make it deliver conversions.
+        addresses: possible 7-bit addresses. bits: of a conversion, straight binary, full scale is the supply.
+        spare: mask of the bits of a word that are always 0. scl_max_hz: fastest SCL of the data sheet.
+        queries, mismatch: identify the chip. setup: messages that make it deliver conversions.
     """
 
     name: str
@@ -43,7 +43,7 @@ class BlockChip:
     spare: int
     scl_max_hz: float
     queries: tuple[Query, ...]
-    judge: Judge
+    mismatch: Mismatch
     setup: tuple[bytes, ...] = ()
 
 
@@ -59,7 +59,7 @@ def chip_named(name: str) -> BlockChip:
     """The converter called ``name``, in any case of letters.
 
     Raises:
-        ValueError: there is none, or it cannot be read in uniform blocks.
+        ValueError: unknown, or not readable in uniform blocks.
     """
     known = ", ".join(_CHIPS)
     if name.lower() in _LEVEL_ONLY:

@@ -1,8 +1,8 @@
-"""The optional DC channel: mean light at the amplifier, by which dark and dazzled are told apart.
+"""The optional DC channel: the mean light at the amplifier, which distinguishes darkness from saturation.
 
-The photodiode's signal path is AC-coupled, so that both look the same there. An ADS1015 or ADS1115 on the same bus
-measures the amplifier's output before the coupling capacitor, twice a second, between two blocks. Whatever happens to
-it, sampling goes on without it.
+The photodiode's signal path is AC-coupled, so that both look alike there. An ADS1015 or ADS1115 on the same bus
+measures the amplifier's output before the coupling capacitor, twice a second, between two blocks. Its failures do not
+affect the sampling.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from hal.photodiode.chips import Query
 log = logging.getLogger(__name__)
 
 _NOT_ACKNOWLEDGED: Final = NACKS | {errno.EIO}
-_ASKED: Final = 3
+_ATTEMPTS: Final = 3
 PERIOD_S: Final = 0.5
-"""More often than conditions of the light last until they are told: what is told then is not of before."""
+"""Shorter than the time for which a light condition must last: a reported condition rests on a recent level."""
 STALE_S: Final = 3.0
 SETTLE_S: Final = 0.02
-"""From a new configuration to a result of it: two conversions at 128 samples/s, whose clock is 10 % slow."""
+"""From a new configuration to its first result: two conversions at 128 samples/s with a clock 10 % slow."""
 
 
 @dataclass(frozen=True, slots=True)
 class LevelInput:
-    """Where the DC channel is.
+    """Configuration of the DC channel.
 
     Attributes:
         chip: ADS1015 or ADS1115. address: 0x48 to 0x4B. channel: 0 to 3.
-        full_scale_v: output of the saturated amplifier, V: what counts as level 1.
-        rest_v: its output without any light, V: level 0 (docs/receiver.md biases it to 0.1 V).
+        full_scale_v: output of the saturated amplifier, V: level 1.
+        rest_v: its output without light, V: level 0 (docs/receiver.md biases it to 0.1 V).
 
     Raises:
-        ValueError: a field that cannot be.
+        ValueError: a field out of range.
     """
 
     chip: str = "ADS1115"
@@ -61,13 +61,13 @@ class LevelInput:
             raise ValueError(f"DC channel at rest at {self.rest_v:g} V: expected 0 to {self.full_scale_v:g} V")
 
 
-async def ask(bus: AsyncBus, address: int, query: Query) -> bytes | None:
-    """Read a register; None where the chip does not acknowledge, or not all bytes come, as often as it is asked.
+async def read_register(bus: AsyncBus, address: int, query: Query) -> bytes | None:
+    """Read a register; None where the chip never acknowledges, or never returns all bytes, in three attempts.
 
     Raises:
-        OSError: for everything else; EIO counts as a missing acknowledgement, some adapters know no other error.
+        OSError: any other error; EIO counts as a missing acknowledgement, the only error of some adapters.
     """
-    for _ in range(_ASKED):
+    for _ in range(_ATTEMPTS):
         try:
             done = await bus.transfer((write(address, query.select), read(address, query.length)))
         except OSError as error:
@@ -80,13 +80,13 @@ async def ask(bus: AsyncBus, address: int, query: Query) -> bytes | None:
 
 
 class LevelMeter:
-    """Reads the DC channel; never raises for anything the chip can do.
+    """Reads the DC channel; failures of the chip are stored, not raised.
 
     Args:
         where: the chip and its input. clock: the loop's.
 
     Attributes:
-        problem: why there is no level; empty if there is.
+        problem: why the level is missing; empty where it is known.
     """
 
     def __init__(self, where: LevelInput, clock: Clock) -> None:
@@ -97,11 +97,11 @@ class LevelMeter:
         self.problem = "not read yet"
 
     def level(self) -> float | None:
-        """Mean light as a fraction of the amplifier's full scale; None where it is not known."""
+        """Mean light as a fraction of the amplifier's full scale; None where unknown."""
         return self._level if self._clock.now() - self._t_read <= STALE_S else None
 
     async def update(self, bus: AsyncBus) -> None:
-        """Read once, after making sure that the chip still has its configuration."""
+        """Check the chip's configuration and read the level once."""
         try:
             problem = await self._read(bus) if await self._configured(bus) else await self._set_up(bus)
         except OSError as error:
@@ -111,12 +111,12 @@ class LevelMeter:
         self.problem = problem
 
     async def _configured(self, bus: AsyncBus) -> bool:
-        answer = await ask(bus, self._where.address, ads1x15.READ_BACK)
+        answer = await read_register(bus, self._where.address, ads1x15.READ_BACK)
         return answer is not None and ads1x15.same_configuration(answer, self._wanted)
 
     async def _set_up(self, bus: AsyncBus) -> str:
         address = self._where.address
-        problem = ads1x15.judge(tuple([await ask(bus, address, query) for query in ads1x15.QUERIES]))
+        problem = ads1x15.mismatch(tuple([await read_register(bus, address, query) for query in ads1x15.QUERIES]))
         if problem:
             return problem
         await bus.transfer((write(address, self._wanted.message()),))
@@ -126,7 +126,7 @@ class LevelMeter:
         return await self._read(bus)
 
     async def _read(self, bus: AsyncBus) -> str:
-        answer = await ask(bus, self._where.address, ads1x15.RESULT)
+        answer = await read_register(bus, self._where.address, ads1x15.RESULT)
         if answer is None:
             return "does not answer"
         volts = ads1x15.fraction(answer) * self._wanted.full_scale_v

@@ -1,4 +1,4 @@
-"""What it means when many blocks are bad: conditions of light, chip and adapter that one block does not prove."""
+"""Diagnosis over many blocks: light, chip and adapter conditions that a single block cannot prove."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from typing import Final
 
 from hal.adc import Clipping, Dark, Dazzled, NoSignal, RawSamples
 from hal.errors import DataInvalid, DeviceFault, HalError
-from hal.photodiode.block_check import Census
+from hal.photodiode.block_check import BlockDefects
 from hal.photodiode.chips import BlockChip
 
 PERSISTS_S: Final = 1.0
-"""A condition of the light is told when it has lasted this long."""
+"""A light condition is reported after it has lasted this long."""
 CLIPPED_SHARE: Final = 0.2
 MISALIGNED_SHARE: Final = 0.02
 GARBLED_BLOCKS: Final = 3
-"""Blocks in a row that the chip cannot have sent, until the bus is opened anew and the chip looked at again."""
+"""Consecutive impossible blocks after which the bus is reopened and the chip identified again."""
 REFRESH_S: Final = 30.0
-"""How often a converter that says one word only, for no known reason, is started afresh."""
+"""Interval of restarts of a converter that repeats one word for no known reason."""
 DARK: Final = 0.005
 DAZZLED: Final = 0.95
-"""Of the DC channel's range between rest and saturation: 9 uA, some 60 lx, with the amplifier of docs/receiver.md."""
+"""Shares of the DC channel's range; DARK is 9 uA, about 60 lx, with the amplifier of docs/receiver.md."""
 
 Level = Callable[[], float | None]
-"""Mean light as a fraction of the amplifier's full scale; None where it is not known."""
+"""Mean light as a fraction of the amplifier's full scale; None where unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """On the latest block and those before it.
+    """The result for the latest block and those before it.
 
     Attributes:
-        sound: the chip can have sent this block. error: what is wrong now. again: the chip has to be looked at again.
+        sound: the chip can have sent this block. error: the present condition. again: identify the chip anew.
     """
 
     sound: bool
@@ -42,7 +42,7 @@ class Verdict:
 
 @dataclass(slots=True)
 class _Lasting:
-    """For how long something has been so."""
+    """Duration of a condition."""
 
     since: float | None = None
 
@@ -54,11 +54,11 @@ class _Lasting:
         return self.since is not None and now - self.since >= PERSISTS_S
 
 
-class Judge:
-    """Watches the blocks of one converter, through all its streams.
+class BlockDiagnosis:
+    """Diagnoses the blocks of one converter, across reconnects.
 
     Args:
-        device: the bus, for errors. chip, address: the converter. level: the DC channel.
+        device: the bus, for errors. chip, address: the converter. level: returns the mean light of the DC channel.
     """
 
     def __init__(self, device: str, chip: BlockChip, address: int, level: Level) -> None:
@@ -68,33 +68,33 @@ class Judge:
         self._garbled = 0
         self._refreshed = float("-inf")
 
-    def look(self, block: RawSamples, census: Census) -> Verdict:
-        """Judge one more block."""
-        if census.floated or census.misaligned > MISALIGNED_SHARE or block.words.size == 0:
+    def add(self, block: RawSamples, defects: BlockDefects) -> Verdict:
+        """Add one block and return the diagnosis."""
+        if defects.floated or defects.misaligned > MISALIGNED_SHARE or block.words.size == 0:
             self._garbled += 1
             again = self._garbled >= GARBLED_BLOCKS
-            return Verdict(sound=False, error=self._say_garbled(census) if again else None, again=again)
+            return Verdict(sound=False, error=self._garbled_error(defects) if again else None, again=again)
         self._garbled = 0
-        frozen = self._frozen.lasts(block.t1, census.stuck or census.constant)
-        quiet = self._quiet.lasts(block.t1, census.quiet)
-        clipped = self._clipped.lasts(block.t1, census.clipped >= CLIPPED_SHARE)
+        frozen = self._frozen.lasts(block.t1, defects.stuck or defects.constant)
+        quiet = self._quiet.lasts(block.t1, defects.quiet)
+        clipped = self._clipped.lasts(block.t1, defects.clipped >= CLIPPED_SHARE)
         if frozen:
-            return self._judge_frozen(block.t1, at_rail=census.clipped == 1.0)
+            return self._diagnose_frozen(block.t1, at_rail=defects.clipped == 1.0)
         if quiet:
-            return Verdict(sound=True, error=self._say_nothing(self._level(), frozen=False))
-        return Verdict(sound=True, error=self._say_clipped() if clipped else None)
+            return Verdict(sound=True, error=self._nothing_error(self._level(), frozen=False))
+        return Verdict(sound=True, error=self._clipped_error() if clipped else None)
 
-    def _judge_frozen(self, now: float, at_rail: bool) -> Verdict:
+    def _diagnose_frozen(self, now: float, at_rail: bool) -> Verdict:
         level = self._level()
         explained = not at_rail and level is not None and (level >= DAZZLED or level <= DARK)
         again = not explained and now - self._refreshed >= REFRESH_S
         if again:
             self._refreshed = now
-        error = self._say_at_rail() if at_rail else self._say_nothing(level, frozen=True)
+        error = self._at_rail_error() if at_rail else self._nothing_error(level, frozen=True)
         return Verdict(sound=True, error=error, again=again)
 
-    def _say_garbled(self, census: Census) -> HalError:
-        if census.floated:
+    def _garbled_error(self, defects: BlockDefects) -> HalError:
+        if defects.floated:
             problem, remedy = "every bit reads 1: the bus floats", "check the converter's power, its ground, and SDA"
             return DeviceFault(self._device, f"{self._where}: {problem}", remedy)
         return DataInvalid(
@@ -103,32 +103,32 @@ class Judge:
             "another kind of chip, or bits lost on the bus: check chip, address, wiring and pull-ups",
         )
 
-    def _say_clipped(self) -> HalError:
+    def _clipped_error(self) -> HalError:
         return Clipping(
             self._device,
             f"{self._where}: more than {100 * CLIPPED_SHARE:.0f} % of the samples are at the rails",
             "too much modulated or flickering light: shade the photodiode or lower the gain",
         )
 
-    def _say_at_rail(self) -> HalError:
+    def _at_rail_error(self) -> HalError:
         return NoSignal(
             self._device,
             f"{self._where}: every word is at the same rail",
             "check the wire from amplifier to converter, its supply, and that it is this kind of chip",
         )
 
-    def _say_nothing(self, level: float | None, *, frozen: bool) -> HalError:
-        """There is no signal: what that means depends on the mean light, and on whether the words move at all."""
-        noun: type[NoSignal] = NoSignal
+    def _nothing_error(self, level: float | None, *, frozen: bool) -> HalError:
+        """The error of a missing signal; its cause follows from the mean light, and from whether the words change."""
+        kind: type[NoSignal] = NoSignal
         if level is None:
             problem = "no signal: no light at all, or so much that the amplifier is saturated"
             problem += ", or a dead converter" if frozen else ""
             remedy = "look at photodiode and lamps; a DC channel (ADS1115) would tell which"
         elif level >= DAZZLED:
-            noun = Dazzled
+            kind = Dazzled
             problem, remedy = "dazzled: the amplifier is saturated", "shade the photodiode or lower the gain"
         elif level <= DARK:
-            noun = Dark
+            kind = Dark
             problem, remedy = "dark: no light reaches the photodiode", "look for a cover, a broken cable, lamps off"
         elif frozen:
             problem = "constant words, though there is light: the converter or its input is dead"
@@ -136,4 +136,4 @@ class Judge:
         else:
             problem = "there is light, but no lamp in it: nothing flickers"
             remedy = "look whether coded lamps are on and in view; check the coupling capacitor"
-        return noun(self._device, f"{self._where}: {problem}", remedy)
+        return kind(self._device, f"{self._where}: {problem}", remedy)

@@ -1,9 +1,8 @@
-"""The driver of a photodiode's converter: reads block after block and comes back from all a bus or a chip can do.
+"""The driver of the photodiode's converter: reads sample blocks and recovers from failures of bus and chip.
 
-What it does about trouble grows with every failure since the last good block: the transaction is tried again; a short
-read makes a STOP and is discarded; the bus is closed and opened anew by name, and the chip looked at again. Waits grow
-from 0.1 to 5 s, and it never gives up. Freeing a line that a chip holds low is left to the adapter's driver and to
-whoever can switch the power: the error says so.
+Recovery escalates with each failure since the last good block: repeat the transaction; send a STOP with a short read;
+reopen the bus by name and identify the chip again. Pauses grow from 0.1 to 5 s; the driver never gives up. It cannot
+free a line that a chip holds low: the error asks a person to switch the power.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ from hal.bus.i2c import AsyncBus, BusOpener, read, write
 from hal.clock import Clock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.lidar import Link
-from hal.photodiode.adapter_limits import Capability, measure
+from hal.photodiode.adapter_limits import AdapterLimits, measure
 from hal.photodiode.bus_watchdog import HANG_S, WatchedBus
 from hal.photodiode.chips import BlockChip, chip_named
-from hal.photodiode.dc_channel import PERIOD_S, LevelInput, LevelMeter, ask
-from hal.photodiode.diagnosis import Judge
+from hal.photodiode.dc_channel import PERIOD_S, LevelInput, LevelMeter, read_register
+from hal.photodiode.diagnosis import BlockDiagnosis
 from hal.photodiode.io_errors import explain, policy_for
 from hal.photodiode.sampler import Sampler, describe
-from hal.photodiode.stream_watch import Followed, Follower
+from hal.photodiode.stream_watch import CheckedBlock, StreamWatch
 from hal.photodiode.timebase import SLOWER
 from hal.port.recovery import stay_connected
 
@@ -39,15 +38,15 @@ _PAUSE_S: Final = (0.1, 5.0)
 _ABSENT_PAUSE_S: Final = 1.0
 _DESCRIBE_BLOCKS: Final = 20
 _KEPT_S: Final = (5.0, 300.0)
-"""How long what was measured of an adapter is kept in spite of doubts: doubling while they turn out unfounded."""
+"""A doubted measurement of the adapter is kept this long (s): doubled while a new measurement confirms it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """How to sample.
+    """Sampling options.
 
     Attributes:
-        block_s: seconds of a block, as far as the adapter can do it. level: the DC channel, if there is one.
+        block_s: wanted duration of a block, s. level: the DC channel; None: not fitted.
     """
 
     block_s: float = 0.05
@@ -58,13 +57,13 @@ class PhotodiodeAdc:
     """A :class:`hal.adc.Adc` for converters that are clocked by SCL.
 
     Args:
-        bus: name of the bus, as the opener takes it. address: 7-bit address of the converter.
+        bus: name of the bus for the opener. address: 7-bit address of the converter.
         chip: MCP3221, ADC121C021 or ADC121C027, in any case of letters.
-        clock: the loop's. opener: opens buses (:func:`hal.port.opening.open_bus`).
+        clock: the loop's. opener: opens buses (:func:`hal.bus.opening.open_bus`).
         sampling: length of blocks, DC channel.
 
     Raises:
-        ValueError: a chip that is not known, or an address or block length it cannot have.
+        ValueError: an unknown chip, or an impossible address or block length.
     """
 
     def __init__(
@@ -92,10 +91,10 @@ class PhotodiodeAdc:
         self._faults = 0
         self._attempts = 0
         self._retries: dict[int, int] = {}
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
         self._limit = ""
         self._kept_s = _KEPT_S[0]
-        self._judge = Judge(bus, self._chip, address, self._level)
+        self._diagnosis = BlockDiagnosis(bus, self._chip, address, self._level)
 
     @property
     def status(self) -> AdcStatus:
@@ -107,11 +106,11 @@ class PhotodiodeAdc:
         await stay_connected(self._status, partial(self._connection, on_samples), self._note, self._pause)
 
     async def _connection(self, on_samples: Callable[[RawSamples], None]) -> None:
-        """Open, stream, recover on the open bus as long as that makes sense; raises to have it opened anew."""
+        """Open, stream, and recover on the open bus; raises when the bus must be reopened."""
         self._status.link = Link.OPENING
         bus = WatchedBus(await self._open(), self._block_s, self._explain, self._note_silence)
-        listening = asyncio.create_task(bus.listen())
-        found: Capability | None = None
+        watching = asyncio.create_task(bus.watch())
+        found: AdapterLimits | None = None
         try:
             while True:
                 try:
@@ -121,11 +120,11 @@ class PhotodiodeAdc:
                 except OSError as error:
                     await self._mend(bus, error)
         finally:
-            listening.cancel()
+            watching.cancel()
             await bus.close()
 
     async def _open(self) -> AsyncBus:
-        """Open the bus; an open that hangs in the kernel is told, and waited for: another try would hang as well."""
+        """Open the bus; an open that hangs in the kernel is reported and awaited: another attempt would hang, too."""
         opening = asyncio.ensure_future(self._opener(self._bus))
         try:
             await asyncio.wait({opening}, timeout=HANG_S)
@@ -137,17 +136,17 @@ class PhotodiodeAdc:
         except asyncio.CancelledError:
             opening.cancel()
             (bus,) = await asyncio.gather(opening, return_exceptions=True)
-            if not isinstance(bus, BaseException):  # it was open already
+            if not isinstance(bus, BaseException):  # the open had succeeded
                 await bus.close()
             raise
 
-    async def _prepare(self, bus: AsyncBus) -> Capability:
-        """Find the chip, make sure that it is the right one, and measure what the adapter can do."""
+    async def _prepare(self, bus: AsyncBus) -> AdapterLimits:
+        """Identify the chip, set it up, and measure the adapter."""
         if self._status.link is Link.STREAMING:
             self._status.link = Link.OPENING
         await bus.transfer((read(self._address, 2),))
         chip, address = self._chip, self._address
-        problem = chip.judge(tuple([await ask(bus, address, query) for query in chip.queries]))
+        problem = chip.mismatch(tuple([await read_register(bus, address, query) for query in chip.queries]))
         if problem:
             raise WrongChip(
                 self._bus, f"the chip at {address:#04x} is no {chip.name}: it {problem}", "check chip and address"
@@ -162,8 +161,8 @@ class PhotodiodeAdc:
         self._limit = found.limit
         return found
 
-    def _compare(self, before: Capability, now: Capability) -> Capability:
-        """Learn from a second measurement how much doubts are worth here."""
+    def _compare(self, before: AdapterLimits, now: AdapterLimits) -> AdapterLimits:
+        """Compare two measurements of the adapter: equal ones lengthen the time for which doubts are ignored."""
         low, high = _KEPT_S
         same = (
             abs(now.scl_hz / before.scl_hz - 1.0) < SLOWER and abs(now.short_s - before.short_s) < SLOWER * now.span_s
@@ -171,46 +170,46 @@ class PhotodiodeAdc:
         self._kept_s = min(2.0 * self._kept_s, high) if same else low
         return now
 
-    async def _stream(self, bus: AsyncBus, found: Capability, on_samples: Callable[[RawSamples], None]) -> None:
-        """Stream until the adapter has to be measured again, or until something goes wrong, which is raised."""
+    async def _stream(self, bus: AsyncBus, found: AdapterLimits, on_samples: Callable[[RawSamples], None]) -> None:
+        """Stream until the adapter must be measured again; raises the error that ends the stream."""
         sampler = Sampler(self._chip, found, self._seq)
 
-        def pass_on(followed: Followed) -> None:
-            if followed.block.seq % _DESCRIBE_BLOCKS == 0:
+        def pass_on(checked: CheckedBlock) -> None:
+            if checked.block.seq % _DESCRIBE_BLOCKS == 0:
                 self._status.extra.update(describe(sampler, found, self._chip, bus.about))
-            self._count(followed)
-            on_samples(followed.block)
+            self._count(checked)
+            on_samples(checked.block)
 
-        follower = Follower(sampler, self._judge, pass_on, self._kept_s)
-        jobs = [asyncio.create_task(bus.stream((read(self._address, found.length),), follower.take))]
+        watch = StreamWatch(sampler, self._diagnosis, pass_on, self._kept_s)
+        jobs = [asyncio.create_task(bus.stream((read(self._address, found.length),), watch.receive))]
         if self._meter is not None:
             jobs.append(asyncio.create_task(self._measure_level(bus, self._meter)))
         try:
             self._status.extra.update(describe(sampler, found, self._chip, bus.about))
-            await follower.watch(jobs)
+            await watch.watch(jobs)
         finally:
             for job in jobs:
                 job.cancel()
             await asyncio.gather(*jobs, return_exceptions=True)
             self._seq, self._lost = sampler.next_seq, self._status.dropped
 
-    def _count(self, followed: Followed) -> None:
-        """One block has come; what is wrong with the light, if anything, stays for as long as it is so."""
-        status, block, error = self._status, followed.block, followed.error
+    def _count(self, checked: CheckedBlock) -> None:
+        """Update the status for one block; a light condition stays in it while it lasts."""
+        status, block, error = self._status, checked.block, checked.error
         status.blocks += 1
         status.blemished += block.blemish != Blemish.NONE
-        status.dropped = self._lost + followed.dropped
+        status.dropped = self._lost + checked.dropped
         status.link = Link.STREAMING
-        if not followed.sound:
+        if not checked.sound:
             return
         if self._faults:
             status.recoveries += 1
         self._faults = self._attempts = 0
         self._retries.clear()
         if error is not None:
-            self._tell(error)
-        elif self._told:
-            self._told.clear()
+            self._log_once(error)
+        elif self._logged:
+            self._logged.clear()
             log.info("%s: %s at %#04x delivers again", self._bus, self._chip.name, self._address)
         status.error = error
 
@@ -224,10 +223,10 @@ class PhotodiodeAdc:
     def _level(self) -> float | None:
         return self._meter.level() if self._meter else None
 
-    # trouble
+    # failures
 
     async def _mend(self, bus: AsyncBus, error: OSError) -> None:
-        """Make ready for another try on the open bus, or raise to have it opened anew."""
+        """Prepare another attempt on the open bus, or raise when the bus must be reopened."""
         number = error.errno or 0
         policy = policy_for(error)
         tries = self._retries.get(number, 0)
@@ -237,7 +236,7 @@ class PhotodiodeAdc:
             raise self._explain(error) from error
         if policy.pause_s:
             await asyncio.sleep(policy.pause_s)
-        if policy.calm:
+        if policy.send_stop:
             with contextlib.suppress(OSError):
                 await bus.transfer((read(self._address, 2),))
 
@@ -245,25 +244,25 @@ class PhotodiodeAdc:
         return explain(error, self._bus, self._chip.name, self._address)
 
     def _note(self, error: HalError) -> None:
-        """The bus has to be opened anew; keep why for the status."""
+        """Store why the bus must be reopened."""
         self._attempts += 1
         self._note_silence(error, True)
 
     def _note_silence(self, error: HalError, certain: bool) -> None:
-        """Nothing comes, whatever is being done about it."""
+        """Store a silence or failure in the status; ``certain``: log it, too."""
         self._status.link, self._status.error = Link.WAITING, error
         self._faults += 1
         if certain:
-            self._tell(error)
+            self._log_once(error)
 
-    def _tell(self, error: HalError) -> None:
-        """Log each kind of problem once, until good blocks come again; see `hal.hokuyo.driver` for the level."""
-        if error.problem not in self._told:
-            self._told.add(error.problem)
+    def _log_once(self, error: HalError) -> None:
+        """Log each problem once, until good blocks arrive; see `hal.hokuyo.driver` for the level."""
+        if error.problem not in self._logged:
+            self._logged.add(error.problem)
             log.info("photodiode: %s", error)
 
     def _pause(self) -> float:
-        """Seconds until the bus is opened again: doubling, with jitter; longer for what only a person can change."""
+        """Seconds until the bus is reopened: doubling, with jitter; longer where only a person can act."""
         low, high = _PAUSE_S
         pause = min(low * 2.0 ** min(max(self._attempts - 1, 0), 10), high)
         if isinstance(self._status.error, DeviceMissing):

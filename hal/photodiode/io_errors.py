@@ -1,4 +1,4 @@
-"""What a failed transaction means, and what is done about it."""
+"""Failed I2C transactions by errno: kind of error, message, remedy, retries."""
 
 from __future__ import annotations
 
@@ -10,25 +10,23 @@ from typing import Final
 from hal.adc import BusStuck, ChipMissing
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 
-Noun = type[HalError]
-
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """How one errno is met.
+    """Response to one errno.
 
     Attributes:
-        noun: the kind of error. problem: with ``{chip}`` and ``{address}``. remedy: what a person can do.
-        retries: on the open bus, before it is opened anew. pause_s: before each of them.
-        calm: a 2-byte read first, which makes a STOP and is discarded.
+        kind: class of the error. problem: with ``{chip}`` and ``{address}``. remedy: what a person can do.
+        retries: on the open bus, before it is reopened. pause_s: before each retry.
+        send_stop: precede the retry with a 2-byte read, which sends a STOP and is discarded.
     """
 
-    noun: Noun
+    kind: type[HalError]
     problem: str
     remedy: str
     retries: int = 0
     pause_s: float = 0.0
-    calm: bool = False
+    send_stop: bool = False
 
 
 _ABSENT: Final = Policy(
@@ -55,7 +53,7 @@ POLICIES: Final[dict[int, Policy]] = {
         "switch the converter's power off and on; look for SDA or SCL held low",
         retries=2,
         pause_s=0.01,
-        calm=True,
+        send_stop=True,
     ),
     errno.EIO: Policy(
         DeviceFault,
@@ -63,7 +61,7 @@ POLICIES: Final[dict[int, Policy]] = {
         "check wiring, pull-ups and cable length; look into the kernel log",
         retries=2,
         pause_s=0.01,
-        calm=True,
+        send_stop=True,
     ),
     errno.EAGAIN: Policy(
         DeviceFault,
@@ -75,7 +73,7 @@ POLICIES: Final[dict[int, Policy]] = {
         DeviceRefused,
         "address {address} is in use by another program, or by a kernel driver",
         "end the other program (fuser -v /dev/i2c-N), or unbind the driver (device-tree overlay)",
-        retries=3,  # who looks what is there (`lumiloop probe`) has an address for some hundredths of a second
+        retries=3,  # `lumiloop probe` holds an address for some 10 ms
         pause_s=0.05,
     ),
     errno.EOPNOTSUPP: _TOO_MUCH,
@@ -90,16 +88,16 @@ POLICIES: Final[dict[int, Policy]] = {
 
 
 def policy_for(error: OSError) -> Policy:
-    """What is done about an error; one that no adapter is known for has the bus opened anew."""
+    """The response to an error; an unlisted one reopens the bus."""
     number = error.errno or 0
     unknown = Policy(DeviceFault, f"unexpected error: {os.strerror(number)}", "look into the kernel log: dmesg | tail")
     return POLICIES.get(number, unknown)
 
 
 def explain(error: OSError, bus: str, chip: str, address: int) -> HalError:
-    """An error of a transaction as one of the four nouns, with the remedy; a bus may know better what has happened."""
+    """Convert a transaction's error to a kind of :mod:`hal.errors`; a bus's own text replaces the problem."""
     policy = policy_for(error)
     problem = policy.problem.format(chip=chip, address=f"{address:#04x}")
     if error.strerror and error.strerror != os.strerror(error.errno or 0):
         problem = error.strerror
-    return policy.noun(bus, problem, policy.remedy)
+    return policy.kind(bus, problem, policy.remedy)

@@ -1,4 +1,4 @@
-"""MCP3221: 12 bits, one input, no registers (Microchip DS20001732).
+"""The MCP3221 converter: 12 bits, one input, no registers (Microchip DS20001732).
 
 A read gives ``0000 D11..D8``, ``D7..D0`` for as long as the host acknowledges; full scale is the supply,
 code = 4096 Vin / VDD. The first conversion begins with the falling SCL edge after the R/W bit, every further one with
@@ -17,8 +17,8 @@ ADDRESSES: Final = frozenset(range(0x48, 0x50))
 _POINTER: Final = Query(b"\x01", 2)
 
 
-def judge(answers: tuple[bytes | None, ...]) -> str:
-    """A chip that takes a register number and answers with bits an MCP3221 keeps at zero is another one."""
+def mismatch(answers: tuple[bytes | None, ...]) -> str:
+    """Text where the chip accepts a register number and returns bits that are always zero in an MCP3221."""
     (answer,) = answers
     if answer is None or len(answer) < 2 or not answer[0] & 0xF0:
         return ""
@@ -32,5 +32,5 @@ CHIP: Final = BlockChip(
     spare=0xF000,
     scl_max_hz=400e3,
     queries=(_POINTER,),
-    judge=judge,
+    mismatch=mismatch,
 )

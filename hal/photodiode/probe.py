@@ -1,7 +1,7 @@
-"""Look for converters on this computer's I2C buses and say what is there, without changing anything.
+"""Identifies the converters on this computer's I2C buses without changing any register (``lumiloop probe``).
 
-What is done at an address: two bytes are read; if something acknowledges, some of its registers are read, for which a
-pointer is written. No register is written. Addresses outside those of the converters we know are left alone.
+At each address two bytes are read. If a chip acknowledges, some of its registers are read, for which a pointer is
+written; no register is. Only the possible addresses of the supported converters are used.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from hal.bus.i2c import NACKS, AsyncBus, BusOpener, read
 from hal.errors import HalError
 from hal.photodiode import adc121c021, ads1x15, mcp3221
 from hal.photodiode.chips import Query
-from hal.photodiode.dc_channel import ask
+from hal.photodiode.dc_channel import read_register
 from hal.photodiode.io_errors import explain
 
 ADDRESSES: Final = tuple(sorted(mcp3221.ADDRESSES | ads1x15.ADDRESSES | adc121c021.ADC121C021.addresses))
 _ELSE: Final = "something that is none of the converters known here"
 _FATAL: Final = frozenset({errno.ETIMEDOUT, errno.ENODEV, errno.ESHUTDOWN, errno.EACCES, errno.EPERM})
-"""After one of these the other addresses need not be asked."""
+"""Errnos after which the other addresses of the bus are not tried."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chip:
-    """Something that answers.
+    """A chip that answers.
 
     Attributes:
         address: 7 bits. name: MCP3221, ADC121C021, ``ADS1015 or ADS1115``; empty for anything else.
-        usable: lights can be decoded with it (else it tells levels, or nothing). problem: why nothing can be said.
+        usable: lights can be decoded with it (else it gives levels, or nothing). problem: why it is not identified.
     """
 
     address: int
@@ -46,11 +46,11 @@ class Chip:
 
 @dataclass(frozen=True, slots=True)
 class BusFinding:
-    """One bus.
+    """The result of one bus.
 
     Attributes:
-        bus: as a driver's bus is named. adapter: its own name. chips: what answered, by address.
-        error: why the bus, or the rest of it, could not be looked at; with a remedy.
+        bus: its name for a driver. adapter: its own name. chips: in order of their addresses.
+        error: why the bus, or the rest of it, could not be probed; with a remedy.
     """
 
     bus: str
@@ -69,17 +69,17 @@ class BusFinding:
 
 
 async def probe_buses(opener: BusOpener, buses: Sequence[str]) -> list[BusFinding]:
-    """Look at each bus; never raises for anything a bus does.
+    """Probe each bus; errors of a bus are returned, not raised.
 
     Args:
-        opener: opens buses (:func:`hal.port.opening.open_bus`).
+        opener: opens buses (:func:`hal.bus.opening.open_bus`).
         buses: their names; those of this computer are :func:`hal.bus.i2c_linux.buses`.
     """
     return [await probe_bus(opener, bus) for bus in buses]
 
 
 async def probe_bus(opener: BusOpener, name: str) -> BusFinding:
-    """Look at one bus."""
+    """Probe one bus."""
     try:
         bus = await opener(name)
     except HalError as error:
@@ -98,7 +98,7 @@ async def probe_bus(opener: BusOpener, name: str) -> BusFinding:
 
 
 async def _look(bus: AsyncBus, address: int) -> Chip | None:
-    """What is at an address, None: nothing. Raises `OSError` where the bus itself is at fault."""
+    """The chip at an address; None: none. Raises `OSError` where the bus itself is at fault."""
     try:
         await bus.transfer((read(address, 2),))
         return await _identify(bus, address)
@@ -113,12 +113,12 @@ async def _look(bus: AsyncBus, address: int) -> Chip | None:
 
 async def _identify(bus: AsyncBus, address: int) -> Chip:
     async def answers(queries: Sequence[Query]) -> tuple[bytes | None, ...]:
-        return tuple([await ask(bus, address, query) for query in queries])
+        return tuple([await read_register(bus, address, query) for query in queries])
 
-    if address in ads1x15.ADDRESSES and not ads1x15.judge(await answers(ads1x15.QUERIES)):
+    if address in ads1x15.ADDRESSES and not ads1x15.mismatch(await answers(ads1x15.QUERIES)):
         return Chip(address, "ADS1015 or ADS1115")
     chip = mcp3221.CHIP if address in mcp3221.ADDRESSES else adc121c021.ADC121C021
-    told = await answers(chip.queries)
-    if chip is mcp3221.CHIP and told != (None,):  # others have zeros there as well, but an MCP3221 takes no data
+    replies = await answers(chip.queries)
+    if chip is mcp3221.CHIP and replies != (None,):  # others may have zeros there, too; an MCP3221 accepts no data
         return Chip(address)
-    return Chip(address) if chip.judge(told) else Chip(address, chip.name, usable=True)
+    return Chip(address) if chip.mismatch(replies) else Chip(address, chip.name, usable=True)

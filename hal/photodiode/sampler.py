@@ -1,4 +1,4 @@
-"""From transactions to sample blocks: words, times, blemishes."""
+"""Converts bus transactions to sample blocks: words, times, blemishes."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ from typing import Final
 
 from hal.adc import Blemish, RawSamples
 from hal.bus.i2c import Transferred
-from hal.photodiode.adapter_limits import Capability
-from hal.photodiode.block_check import Census, inspect
+from hal.photodiode.adapter_limits import AdapterLimits
+from hal.photodiode.block_check import BlockDefects, inspect
 from hal.photodiode.chips import CLOCKS_PER_WORD, BlockChip
 from hal.photodiode.timebase import SclClock
 
 IDLE_S: Final = 0.1
-"""After a pause like this the first conversion is off: its sample was taken when the last transaction ended."""
+"""After a pause this long the first conversion is dropped: its sample dates from the end of the last transaction."""
 
 
 class Sampler:
     """Makes sample blocks of one stream of equal reads.
 
     Args:
-        chip: whose words they are. found: what was measured of the adapter. first: number of the first block.
+        chip: the converter. found: the adapter's measured limits. first: number of the first block.
     """
 
-    def __init__(self, chip: BlockChip, found: Capability, first: int = 0) -> None:
+    def __init__(self, chip: BlockChip, found: AdapterLimits, first: int = 0) -> None:
         self._chip, self._length, self._seq = chip, found.length, first
         self.scl = SclClock(found.length, found.span_s, found.short_s, found.spread_s)
         self._dropped = 0
@@ -30,18 +30,18 @@ class Sampler:
 
     @property
     def next_seq(self) -> int:
-        """Number of the block to come; those that were dropped have numbers too."""
+        """Number of the next block; dropped blocks have numbers, too."""
         return self._seq
 
-    def take(self, done: Transferred, dropped: int) -> tuple[RawSamples, Census]:
-        """One block, and a count of what is wrong with it.
+    def to_block(self, done: Transferred, dropped: int) -> tuple[RawSamples, BlockDefects]:
+        """Build one block and count its defects.
 
         Args:
             done: the transaction.
-            dropped: blocks the loop had no time for, since the stream began.
+            dropped: blocks dropped by the loop since the stream began.
         """
-        timing = self.scl.take(done.t0, done.t1)
-        words, blemish, census = inspect(done.reads[0], self._length, self._chip.spare, self._chip.bits)
+        timing = self.scl.add(done.t0, done.t1)
+        words, blemish, defects = inspect(done.reads[0], self._length, self._chip.spare, self._chip.bits)
         t_first = timing.t_first
         if self._bus_rests_since is None or done.t0 - self._bus_rests_since > IDLE_S:
             words, t_first = words[1:], t_first + 1.0 / timing.rate_hz
@@ -55,17 +55,17 @@ class Sampler:
             self._seq, done.t0, done.t1, t_first, timing.rate_hz, words, self._chip.bits, blemish, timing.slack_s
         )
         self._seq += 1
-        return block, census
+        return block, defects
 
     def _misses(self, done: Transferred, dropped: int) -> bool:
-        """Whether there should have been another block before this one."""
+        """Whether a block is missing before this one."""
         if self._bus_rests_since is None:
             return self._seq > 0
         return dropped != self._dropped or done.t0 - self._bus_rests_since > done.t1 - done.t0
 
 
-def describe(sampler: Sampler, found: Capability, chip: BlockChip, about: str) -> dict[str, str]:
-    """What `lumiloop status` shows of a converter."""
+def describe(sampler: Sampler, found: AdapterLimits, chip: BlockChip, about: str) -> dict[str, str]:
+    """The facts of a converter for `lumiloop status`."""
     hz = sampler.scl.hz
     facts = {
         "chip": chip.name,

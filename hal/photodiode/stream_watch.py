@@ -1,4 +1,4 @@
-"""Follow a running stream: transactions to sample blocks, and a watch over the ways in which a stream can go wrong."""
+"""Watches a running sample stream: transactions to checked blocks, and detection of the conditions that end it."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any
 from hal.adc import RawSamples
 from hal.bus.i2c import Transferred
 from hal.errors import HalError
-from hal.photodiode.diagnosis import Judge
+from hal.photodiode.diagnosis import BlockDiagnosis
 from hal.photodiode.sampler import Sampler
 
 
 @dataclass(frozen=True, slots=True)
-class Followed:
-    """One block with what is known about it.
+class CheckedBlock:
+    """One block with its diagnosis.
 
     Attributes:
-        sound: the chip can have sent it. dropped: blocks the loop had no time for, since the stream began.
-        error: what is wrong with light or adapter for longer than this block; None: nothing.
+        sound: the chip can have sent it. dropped: blocks dropped by the loop since the stream began.
+        error: a lasting condition of light or adapter; None: none.
     """
 
     block: RawSamples
@@ -29,40 +29,40 @@ class Followed:
     error: HalError | None
 
 
-OnBlock = Callable[[Followed], None]
+OnBlock = Callable[[CheckedBlock], None]
 
 
-class Follower:
-    """Takes the transactions of one stream.
+class StreamWatch:
+    """Receives the transactions of one stream and detects its end.
 
     Args:
-        sampler: makes blocks. judge: looks at many of them. on_block: gets each.
-        kept_s: what was measured of the adapter is kept at least this long, however doubtful it has become.
+        sampler: builds blocks. diagnosis: over many blocks. on_block: receives each.
+        kept_s: the measurement of the adapter is kept at least this long, in spite of doubt.
     """
 
-    def __init__(self, sampler: Sampler, judge: Judge, on_block: OnBlock, kept_s: float) -> None:
-        self._sampler, self._judge, self._on_block = sampler, judge, on_block
+    def __init__(self, sampler: Sampler, diagnosis: BlockDiagnosis, on_block: OnBlock, kept_s: float) -> None:
+        self._sampler, self._diagnosis, self._on_block = sampler, diagnosis, on_block
         self._loop = asyncio.get_running_loop()
         self._trouble: asyncio.Future[HalError | None] = self._loop.create_future()
         self._kept_until = self._loop.time() + kept_s
 
-    def take(self, done: Transferred, dropped: int) -> None:
-        """One transaction, from the bus."""
+    def receive(self, done: Transferred, dropped: int) -> None:
+        """Process one transaction of the bus."""
         if self._trouble.done():
             return
-        block, census = self._sampler.take(done, dropped)
-        verdict = self._judge.look(block, census)
-        self._on_block(Followed(block, verdict.sound, dropped, verdict.error))
+        block, defects = self._sampler.to_block(done, dropped)
+        verdict = self._diagnosis.add(block, defects)
+        self._on_block(CheckedBlock(block, verdict.sound, dropped, verdict.error))
         if verdict.again:
             self._trouble.set_result(verdict.error)
         elif self._sampler.scl.doubt and self._loop.time() > self._kept_until:
             self._trouble.set_result(None)
 
     async def watch(self, jobs: Sequence[asyncio.Task[None]]) -> None:
-        """Return when the adapter has to be measured again; raise whatever else ends the stream.
+        """Return when the adapter must be measured again; raise any other end of the stream.
 
         Raises:
-            OSError: from a job. HalError: the chip has to be looked at again.
+            OSError: from a job. HalError: the chip must be identified again.
         """
         watched: list[asyncio.Future[Any]] = [self._trouble, *jobs]
         while True:

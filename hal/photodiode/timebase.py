@@ -1,13 +1,13 @@
-"""When the conversions of a block took place, from nothing but the times around transactions.
+"""Times of the conversions in a block, estimated from the times around transactions.
 
-A transaction of n bytes takes ``(10 + 9 n) / f`` on the bus and a fixed overhead around it. The nominal ``f`` is never
-right (dividers round, core clocks are scaled), so it is measured: shortest long transaction against shortest short one.
-Everything that disturbs a transaction makes it longer, so the shortest is the undisturbed one.
+A transaction of n bytes takes ``(10 + 9 n) / f`` on the bus and a fixed overhead around it. The nominal ``f`` is
+inaccurate (dividers round, core clocks are scaled). It is measured: shortest long transaction against shortest short
+one. Every disturbance makes a transaction longer, so that the shortest one is undisturbed.
 
-Blocks are anchored at their beginning. ``t0`` is taken by a thread that is running, a moment before it calls the
-kernel. ``t1`` is taken when it has been woken and has the interpreter's lock again: on a busy computer that is often
-milliseconds late (two cores shared with other work: 4 ms in the worst tenth of blocks), which would shift the samples
-by twenty chips. What can delay START is another client of the bus; by how much at most is told as slack.
+Blocks are anchored at their beginning. ``t0`` is read by a running thread right before its kernel call. ``t1`` is read
+after the thread was woken and has regained the interpreter lock. On a busy computer that is often milliseconds late
+(two cores shared with other work: 4 ms in the worst tenth of blocks), which would shift the samples by twenty chips.
+Only another client of the bus can delay START; the slack is the upper bound of that delay.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from typing import Final
 from hal.photodiode.chips import CLOCKS_AROUND, CLOCKS_PER_WORD, FIRST_CLOCK
 
 WINDOW: Final = 200
-"""Blocks over which the shortest is sought; the one before counts as well, so that there is always an answer."""
+"""Blocks of a window of the minimum; the previous window counts as well, so that a minimum always exists."""
 SPREAD_BLOCKS: Final = 64
 STEP_BLOCKS: Final = 16
-"""Blocks that must all be too long, by more than SLOWER of their length, until what was measured is doubted."""
+"""Consecutive blocks that exceed the minimum by more than SLOWER of their length before it is doubted."""
 SLOWER: Final = 1e-3
 FASTER: Final = 5e-3
-"""One block that is shorter than ever by more than this is enough."""
+"""A single block shorter than the minimum by more than this share is enough for doubt."""
 LIMIT_FLOOR_S: Final = 30e-6
 LIMIT_MEDIANS: Final = 8.0
-"""Of the median excess: with exponential delays four undisturbed blocks in a thousand are beyond it."""
+"""Times the median excess: with exponential delays 0.4 % of the undisturbed blocks exceed it."""
 SHORT: Final = 2
-"""Bytes of the short read that tells the overhead."""
+"""Bytes of the short read that measures the overhead."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Where one block lies.
+    """Times of one block.
 
     Attributes:
-        t_first: earliest ``t_mono`` of the first conversion. slack_s: by how much later it may have been.
-        rate_hz: conversions per second. excess_s: by how much the transaction was longer than the shortest of its kind.
-        stretched: longer than usual disturbances explain, or of a rate that is not known.
+        t_first: earliest ``t_mono`` of the first conversion. slack_s: upper bound of its delay after ``t_first``.
+        rate_hz: conversions per second. excess_s: excess of the transaction over the shortest of its length.
+        stretched: longer than usual disturbances explain, or at an unknown rate.
     """
 
     t_first: float
@@ -52,20 +52,20 @@ class Timing:
 
 
 def scl_hz(length: int, span_s: float, short_s: float) -> float:
-    """SCL frequency from the spans of a read of ``length`` bytes and of a 2-byte read; 0 where they make no sense."""
+    """SCL frequency from the durations of a ``length``-byte and a 2-byte read; 0 where they are inconsistent."""
     extra = span_s - short_s
     return 9.0 * (length - SHORT) / extra if extra > 0.0 and length > SHORT else 0.0
 
 
 class SclClock:
-    """Follows SCL through a stream of equal blocks.
+    """Tracks the SCL frequency through a stream of equal blocks.
 
-    Slow drift is followed. A step of SCL and a step of the overhead look alike in blocks of one length: then there is
-    :attr:`doubt`, and both have to be measured anew.
+    Slow drift is tracked. A step of SCL and a step of the overhead look alike in blocks of one length: that sets
+    :attr:`doubt`, and both must be measured again.
 
     Args:
         length: bytes of a block. span_s: of the best block so far. short_s: of the best 2-byte read.
-        spread_s: median excess of short reads, for the time until blocks tell their own.
+        spread_s: median excess of short reads, used until enough blocks have arrived.
     """
 
     def __init__(self, length: int, span_s: float, short_s: float, spread_s: float = 0.0) -> None:
@@ -85,12 +85,12 @@ class SclClock:
 
     @property
     def doubt(self) -> bool:
-        """Whether SCL or the overhead seem to be other than they were measured."""
+        """Whether SCL or the overhead seem to have changed since their measurement."""
         return self._faster or self._late_in_a_row >= STEP_BLOCKS
 
     @property
     def spread_s(self) -> float:
-        """Median excess: how well times around a transaction are known here."""
+        """Median excess, s: the uncertainty of times around a transaction."""
         return median(self._excesses)
 
     @property
@@ -102,7 +102,7 @@ class SclClock:
     def _shortest(self) -> float:
         return min(self._best, self._previous)
 
-    def take(self, t0: float, t1: float) -> Timing:
+    def add(self, t0: float, t1: float) -> Timing:
         """Time one block."""
         span = t1 - t0
         self._faster |= span < (1.0 - FASTER) * self._shortest
@@ -114,7 +114,7 @@ class SclClock:
         limit = max(LIMIT_FLOOR_S, LIMIT_MEDIANS * self.spread_s)
         self._late_in_a_row = self._late_in_a_row + 1 if excess > max(limit, SLOWER * span) else 0
         stretched = self.doubt or excess > limit
-        if not self.doubt:  # else the spread would grow until nothing were late any more
+        if not self.doubt:  # else the spread would grow until no block counted as late
             self._excesses.append(excess)
         self._late_share += (stretched - self._late_share) / SPREAD_BLOCKS
         hz = self.hz

@@ -1,1 +1,1 @@
-"""Byte ports: serial, TCP, memory; opening and recovery."""
+"""Byte ports to devices (serial, TCP, memory), their opener, and the reconnect loop of a driver."""

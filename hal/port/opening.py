@@ -1,14 +1,11 @@
-"""Real devices by their names: serial ports, network sensors, I2C buses.
+"""Opens a lidar's byte port by its device name: a serial port or a TCP connection.
 
-Drivers get an opener injected; these are the ones the daemon injects. Each kind's module is imported when a device of
-that kind is opened, so that nobody pays for a library of a kind he does not have.
+A driver receives its opener as an argument; the daemon passes the one in this module. The module of each kind of port
+is imported when a device of that kind is opened. A robot with a serial sensor loads no code for network sensors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from hal.bus.i2c import AsyncBus, Bus
 from hal.errors import DeviceRefused
 from hal.port.port import Port
 
@@ -18,7 +15,7 @@ async def open_port(device: str, baud: int) -> Port:
 
     Args:
         device: path of a serial port (``/dev/ttyACM0``) or ``tcp://host:port`` (SCIP: port 10940, the default).
-        baud: line rate in bit/s; without meaning on USB CDC and TCP.
+        baud: line rate in bit/s; ignored on USB CDC and TCP.
 
     Raises:
         DeviceMissing: no such path, unplugged, host unreachable.
@@ -33,41 +30,3 @@ async def open_port(device: str, baud: int) -> Port:
 
         return await open_serial_port(device, baud)
     raise DeviceRefused(device, "not a device name", "expected a path such as /dev/ttyACM0, or tcp://host:port")
-
-
-def blocking_opener(name: str) -> Callable[[str], Bus]:
-    """What opens a bus of this kind of name, blocking; its module is imported only now.
-
-    Raises:
-        DeviceRefused: a name of no kind.
-    """
-    if name.startswith(("unix:", "tcp://")):
-        from hal.bus.i2c_remote import open_remote
-
-        return open_remote
-    if name.startswith(("/", "adapter:")):
-        from hal.bus.i2c_linux import open_linux
-
-        return open_linux
-    raise DeviceRefused(
-        name,
-        "not the name of an I2C bus",
-        "expected a path such as /dev/i2c-1, adapter:NAME, unix:/path, or tcp://host:port",
-    )
-
-
-async def open_bus(name: str) -> AsyncBus:
-    """Open a real or a remote bus, with a thread of its own: the :class:`BusOpener` of the daemon.
-
-    Args:
-        name: path of a device node (``/dev/i2c-1``, or a link to one), ``adapter:NAME`` for the only adapter whose
-            own name contains NAME (bus numbers of USB adapters change), ``unix:/path`` or ``tcp://host:port`` for a
-            bus served by :mod:`hal.bus.i2c_server`.
-
-    Raises:
-        DeviceMissing: no such bus, unplugged, host unreachable.
-        DeviceRefused: permission, busy, not an I2C bus, or a name of no kind.
-    """
-    from hal.bus.i2c_thread import open_threaded
-
-    return await open_threaded(name, blocking_opener(name))

@@ -1,7 +1,7 @@
-"""Byte ports: the one seam between drivers and the operating system (a tty, a TCP socket, or memory).
+"""The byte port interface between drivers and the operating system (a tty, a TCP socket, or memory).
 
 A port delivers bytes with their arrival time by callback from the loop thread; there is no reader thread. The same
-driver code runs over all three kinds, which is what lets virtual-time tests carry the very bytes a tty carries.
+driver code runs over all three kinds, so that tests in virtual time carry the same bytes as a tty.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from hal.clock import Clock
 from hal.errors import DeviceMissing, HalError
 
 OnData = Callable[[bytes, float], None]
-"""Called with bytes and the ``t_mono`` taken before anything else was done with them."""
+"""Called with bytes and their arrival time ``t_mono``, read before any processing."""
 
 OnLost = Callable[[HalError], None]
 """Called once when the port is gone; no data follow."""
@@ -41,18 +41,18 @@ class Port(Protocol):
         ...
 
     def close(self) -> None:
-        """Close; idempotent; `on_lost` is not called for a close of our own."""
+        """Close; idempotent; does not call `on_lost`."""
         ...
 
 
 class PortOpener(Protocol):
-    """Opens a port by its name. Drivers get this injected, so that a test can hand out memory ports."""
+    """Opens a port by its name. It is injected into drivers, so that a test can supply memory ports."""
 
     async def __call__(self, device: str, baud: int) -> Port:
-        """Open ``device`` (path, ``tcp://host:port``, or whatever the opener knows).
+        """Open ``device`` (path, ``tcp://host:port``, or another name that the opener supports).
 
         Raises:
-            DeviceMissing: nothing there. DeviceRefused: permission, busy, not a tty.
+            DeviceMissing: no such device. DeviceRefused: permission, busy, not a tty.
         """
         ...
 
@@ -61,8 +61,8 @@ class MemoryPort:
     """One end of a pair that carries bytes inside one event loop, in virtual or real time.
 
     Every write arrives at the other end as one piece, from the loop, never inside the writer's call. There is no
-    latency, no line rate and no limit to what is in flight: a fake device that wants those makes its own delays and
-    pieces. :attr:`peer_baud` lets it notice that the driver listens at another rate.
+    latency, line rate or limit of bytes in flight: a fake device simulates its own delays and pieces.
+    :attr:`peer_baud` shows it the rate at which the driver reads.
     """
 
     def __init__(self, name: str, clock: Clock) -> None:
@@ -83,12 +83,12 @@ class MemoryPort:
 
     @property
     def closed(self) -> bool:
-        """True once this end was closed or the other end went away and that was told."""
+        """True once this end was closed, or the loss of the other end was delivered."""
         return self._closed
 
     @property
     def peer_baud(self) -> int:
-        """Line rate the other end was last set to, 0 if never."""
+        """Line rate set at the other end, 0 if none was."""
         return self._peer.baud if self._peer else 0
 
     def start(self, on_data: OnData, on_lost: OnLost) -> None:
@@ -97,18 +97,18 @@ class MemoryPort:
         self._wake()
 
     def write(self, data: bytes) -> None:
-        """Hand ``data`` to the other end; raises `DeviceMissing` after either end was closed."""
+        """Send ``data`` to the other end; raises `DeviceMissing` after either end was closed."""
         if self._closed or self._lost or self._peer is None:
             raise DeviceMissing(self._name, "the port is closed")
         self._peer._inbox.append(bytes(data))
         self._peer._wake()
 
     def set_baud(self, baud: int) -> None:
-        """Remember the rate for the other end to look at."""
+        """Store the rate; the other end reads it as :attr:`peer_baud`."""
         self.baud = baud
 
     def close(self) -> None:
-        """Close; the other end is told, after the bytes already written to it (an unplug, or a daemon that left)."""
+        """Close; the other end is lost after the bytes already written to it (as by an unplug)."""
         if self._closed:
             return
         self._closed = True
@@ -130,11 +130,11 @@ class MemoryPort:
 
 
 def memory_pair(clock: Clock, name: str = "memory") -> tuple[MemoryPort, MemoryPort]:
-    """Two ends of a byte channel in memory, for fakes and replay; which end is whose does not matter.
+    """Two ends of a byte channel in memory, for fakes and replay; both ends are alike.
 
     Args:
         clock: gives the arrival times, a :class:`hal.clock.LoopClock` under virtual time.
-        name: what both ends are called in errors.
+        name: of both ends in errors.
     """
     ends = MemoryPort(name, clock), MemoryPort(name, clock)
     ends[0]._peer, ends[1]._peer = ends[1], ends[0]

@@ -1,4 +1,4 @@
-"""How a driver stays with its device: connection after connection, until it is cancelled."""
+"""The reconnect loop of a driver: open, run, pause, open again, until cancelled."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ async def stay_connected(
     note: Callable[[HalError], None],
     pause: Callable[[], float],
 ) -> None:
-    """Open anew whatever has ended, after a pause.
+    """Run connections one after the other, with a pause in between.
 
     Args:
         status: its ``link`` is WAITING between two connections, and CLOSED at the end.
-        connection: one from its opening to its end, which raises `HalError` where there is something to be noted.
-        note: keeps what a connection ended with.
-        pause: seconds until the next.
+        connection: runs one connection from open to end; raises `HalError` where the end has a cause.
+        note: receives that error.
+        pause: returns the seconds until the next connection.
     """
     try:
         while True:

@@ -1,7 +1,7 @@
 """A serial port read by the event loop, without a reader thread.
 
-The line is opened so that an empty read means hang-up and nothing else: ``inter_byte_timeout=0`` makes pyserial set
-VMIN=1, VTIME=0, where a spurious wake-up gives EAGAIN; with VMIN=0 it would look like an unplug.
+The line is opened so that an empty read always means hang-up: ``inter_byte_timeout=0`` makes pyserial set VMIN=1,
+VTIME=0, where a spurious wake-up gives EAGAIN. With VMIN=0 it would look like an unplug.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import serial
 
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 from hal.clock import Clock, SystemClock
 from hal.errors import KEPT_AWAY, DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.port.port import OnData, OnLost
@@ -28,7 +28,7 @@ _GONE = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EIO, errno.ESH
 NOT_SERIAL = "not a serial port"
 _DRIVERS = Path("/sys/bus/usb/drivers")
 _MODULES = {"ttyACM": ("cdc_acm",), "ttyUSB": ("ftdi_sio", "cp210x", "ch341", "pl2303")}
-"""Kernel modules that make device files of such names; they come with the device, where the system has them."""
+"""Kernel modules behind device files of such names; the kernel loads them with the device where they are installed."""
 _UNPLUGGED = "plug it in again, or check its cable and power; it is reopened by itself"
 
 
@@ -60,7 +60,7 @@ class SerialPort:
         """Send a command at once.
 
         Raises:
-            DeviceMissing: the port is gone. DeviceFault: the line does not take the bytes (its buffer is full).
+            DeviceMissing: the port is gone. DeviceFault: the line does not accept the bytes (its buffer is full).
         """
         if self._closed:
             raise DeviceMissing(self._name, "the port is closed")
@@ -74,7 +74,7 @@ class SerialPort:
             raise DeviceFault(self._name, f"took {sent} of {len(data)} command bytes", "the line is blocked: replug it")
 
     def set_baud(self, baud: int) -> None:
-        """Change the line rate in bit/s; raises `DeviceRefused` for a rate the adapter cannot do."""
+        """Change the line rate in bit/s; raises `DeviceRefused` for a rate that the adapter does not support."""
         try:
             self._line.baudrate = baud
         except (ValueError, OSError, termios.error) as error:
@@ -121,12 +121,12 @@ class SerialPort:
 async def open_serial_port(device: str, baud: int, clock: Clock | None = None, style: str = "8N1") -> SerialPort:
     """Open ``device`` exclusively (advisory lock), raw, without flow control; ``style``: bits, parity, stop bits.
 
-    The kernel may block in ``open`` for seconds when a USB device is wedged, so that one call runs beside the loop.
+    The kernel may block in ``open`` for seconds when a USB device is wedged: the call runs in a thread.
 
     Raises:
-        DeviceMissing: nothing there. DeviceRefused: permission, busy, not a serial port, impossible rate.
+        DeviceMissing: no such device. DeviceRefused: permission, busy, not a serial port, unsupported rate.
     """
-    opening = beside(partial(_open_line, device, baud, style), "open")
+    opening = run_in_thread(partial(_open_line, device, baud, style), "open")
     try:
         line = await asyncio.shield(opening)
     except asyncio.CancelledError:
@@ -149,7 +149,7 @@ def _open_line(device: str, baud: int, style: str) -> serial.Serial:
         exclusive=True,
         inter_byte_timeout=0,
     )
-    if "ttyUSB" in os.path.realpath(device):  # FTDI: 1 ms instead of 16 ms between transfers; others have no such timer
+    if "ttyUSB" in os.path.realpath(device):  # FTDI: 1 ms instead of 16 ms between transfers
         with contextlib.suppress(ValueError, OSError):
             line.set_low_latency_mode(True)
     return line
@@ -171,7 +171,7 @@ def _errno_of(error: BaseException | None) -> int:
 
 
 def explain_open_error(device: str, baud: int, error: BaseException, style: str = "8N1") -> HalError:
-    """Turn what the operating system said about an open into one of the four nouns, with the remedy."""
+    """Turn the error of a failed open into one of the four kinds of :mod:`hal.errors`, with a remedy."""
     number = _errno_of(error)
     path = Path(device)
     if number == errno.ENOENT:
@@ -196,7 +196,7 @@ def explain_open_error(device: str, baud: int, error: BaseException, style: str 
 
 
 def _not_loaded(path: Path) -> str:
-    """Which kernel module there is not; empty where it is there, or the name does not tell."""
+    """Remedy that names the missing kernel module; empty where it is loaded, or the device's kind is unknown."""
     for kind, modules in _MODULES.items():
         if path.name.startswith(kind) and not any((_DRIVERS / module).exists() for module in modules):
             return f"; its kernel module is not loaded: modprobe {' or '.join(modules)}"

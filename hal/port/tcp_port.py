@@ -1,4 +1,4 @@
-"""A TCP connection to a sensor (Ethernet models: port 10940, one client at a time)."""
+"""A byte port over TCP, for Ethernet sensors (HOKUYO: port 10940, one client at a time)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TcpPort(asyncio.Protocol):
         return self._name
 
     def start(self, on_data: OnData, on_lost: OnLost) -> None:
-        """Begin delivering; bytes that came since the connection was made are delivered first, with their times."""
+        """Begin delivering; bytes received since the connection was made come first, with their times."""
         self._on_data, self._on_lost = on_data, on_lost
         asyncio.get_running_loop().call_soon(self._deliver_early)
 
@@ -50,7 +50,7 @@ class TcpPort(asyncio.Protocol):
         self._transport.write(data)
 
     def set_baud(self, baud: int) -> None:
-        """Nothing: Ethernet has no line rate."""
+        """Do nothing: Ethernet has no line rate."""
 
     def close(self) -> None:
         """Close at once; unsent bytes are dropped."""
@@ -60,7 +60,7 @@ class TcpPort(asyncio.Protocol):
             self._transport.abort()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """asyncio: the connection stands."""
+        """asyncio: the connection is established."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         link: socket.socket = transport.get_extra_info("socket")
@@ -87,21 +87,21 @@ class TcpPort(asyncio.Protocol):
         self._lost = DeviceMissing(
             self._name, f"connection {why}", "check its power and network cable, and that no second client uses it"
         )
-        self._tell_lost()
+        self._deliver_lost()
 
     def _deliver_early(self) -> None:
         while self._early and self._on_data is not None and not self._closed:
             self._on_data(*self._early.pop(0))
-        self._tell_lost()
+        self._deliver_lost()
 
-    def _tell_lost(self) -> None:
+    def _deliver_lost(self) -> None:
         if self._lost is not None and self._on_lost is not None and not self._early and not self._closed:
             on_lost, self._on_lost = self._on_lost, None
             on_lost(self._lost)
 
 
 def parse_tcp_name(device: str) -> tuple[str, int]:
-    """Host and port of ``tcp://host[:port]``; raises `DeviceRefused` where that is not what it is."""
+    """Host and port of ``tcp://host[:port]``; raises `DeviceRefused` for anything else."""
     try:
         parts = urlsplit(device)
         host, port = parts.hostname, parts.port
@@ -116,7 +116,7 @@ async def open_tcp_port(device: str, clock: Clock | None = None) -> TcpPort:
     """Connect to ``tcp://host[:port]`` within 2 s.
 
     Raises:
-        DeviceMissing: unknown host, unreachable, no answer. DeviceRefused: refused (busy), or a name that is none.
+        DeviceMissing: unknown host, unreachable, no answer. DeviceRefused: refused (busy), or not a ``tcp://`` name.
     """
     host, number = parse_tcp_name(device)
     port = TcpPort(device, clock or SystemClock())
@@ -132,7 +132,7 @@ async def open_tcp_port(device: str, clock: Clock | None = None) -> TcpPort:
 
 
 def _unnamed(device: str) -> str:
-    """Says which port was meant by a name without one."""
+    """Text that names the default port, for a device name without a port."""
     return "" if urlsplit(device).port is not None else f" at port {DEFAULT_TCP_PORT}, as the name has none"
 
 
@@ -144,7 +144,7 @@ async def _resolved(device: str, host: str, number: int) -> list[inet.Address]:
 
 
 async def _connect(port: TcpPort, addresses: list[inet.Address]) -> None:
-    """To the first address that can be reached; raises what the last one has said."""
+    """Connect to the first reachable address; raises the error of the last one."""
     problem = OSError("no address")
     for address in addresses:
         host, interface = address[1][0], inet.scope(address)

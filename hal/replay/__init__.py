@@ -1,1 +1,1 @@
-"""Recorded logs played back as devices: CARMEN, own recordings, raw SCIP captures."""
+"""Recorded logs read and played back as devices: CARMEN logs, lumiloop recordings, raw SCIP captures."""

@@ -1,4 +1,4 @@
-"""Raw captures of a serial line: what a SCIP sensor said (``.logr``) and what its host said (``.logw``).
+"""Reads raw captures of a serial line: the bytes of a SCIP sensor (``.logr``) and of its host (``.logw``).
 
 Each record is an 8-byte big-endian time in microseconds, a 4-byte big-endian length, and the bytes.
 """
@@ -17,19 +17,19 @@ from hal.replay.text import unreadable
 
 _HEAD: Final = struct.Struct(">QI")
 _LONGEST: Final = 1 << 20
-_LATEST_US: Final = 1 << 53  # 285 years: what comes later is no time but text
+_LATEST_US: Final = 1 << 53  # 285 years: a later time is text, not a time
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Bytes as they came off the line at ``t_us``, microseconds of the capturing host's clock."""
+    """Bytes received at ``t_us``, microseconds of the capturing host's clock."""
 
     t_us: int
     data: bytes
 
 
 def looks_like_capture(head: bytes) -> bool:
-    """Whether a file that begins with ``head`` (at least 12 bytes) can be such a capture."""
+    """Whether a file that begins with ``head`` (at least 12 bytes) can be a capture."""
     if len(head) < _HEAD.size:
         return False
     t_us: int
@@ -39,11 +39,11 @@ def looks_like_capture(head: bytes) -> bool:
 
 
 def read_capture(path: Path, report: LogReport) -> list[Chunk]:
-    """All chunks of a capture; a torn end costs only the last chunk and is noted in ``report``.
+    """All chunks of a capture; a truncated end loses only the last chunk and is noted in ``report``.
 
     Raises:
-        DeviceMissing, DeviceRefused: the file is not there or may not be read.
-        DataInvalid: empty, or not such a capture.
+        DeviceMissing, DeviceRefused: no such file, or no permission to read it.
+        DataInvalid: empty, or not a capture.
     """
     try:
         data = path.read_bytes()

@@ -1,8 +1,8 @@
-"""A CARMEN log as a lidar with wheel odometry.
+"""Reads a CARMEN log as a lidar with wheel odometry.
 
-The whole log is read first, because what a line leaves out (beam geometry, the no-return range, where the laser sits on
-the robot, a monotone time) only the whole log can say. Ranges become whole millimetres, finer than any of these lasers
-resolves. Lines that cannot be used are skipped and counted with their numbers; the rest is played in file order.
+The whole log is read first. Beam geometry, no-return range, mount of the laser and monotone time are missing in its
+lines and follow only from the log as a whole. Ranges become whole millimetres, finer than the resolution of these
+lasers. Unusable lines are skipped and counted with their numbers; the rest is played in file order.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hal.lidar import LidarGeometry, RawScan
 from hal.odometry import RawOdometry
 from hal.replay.carmen_lines import LaserLine, LineProblem, OdometryLine, ParameterLine, parse
 from hal.replay.carmen_scans import CarmenScan, convert
-from hal.replay.geometry_guess import beam_rule
+from hal.replay.geometry_guess import beam_geometry
 from hal.replay.monotone_stamps import Monotone, monotone
 from hal.replay.mount import log_mount
 from hal.replay.report import LogReport
@@ -36,11 +36,11 @@ _REMEDY: Final = "name a log with laser lines, or make one with `python -m tools
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarmenLog:
-    """A log that has been read.
+    """A log in memory.
 
     Attributes:
         stamps: original stamp of every scan in file order, seconds. time: their monotone time (first near 0).
-        mount: (x, y, yaw) of the laser on the robot, m and rad. report: what was skipped or assumed.
+        mount: (x, y, yaw) of the laser on the robot, m and rad. report: skipped lines and assumptions.
     """
 
     path: Path
@@ -64,7 +64,7 @@ class CarmenLog:
 
     @property
     def has_odometry(self) -> bool:
-        """Whether the log carries wheel odometry worth using."""
+        """Whether the log carries usable wheel odometry."""
         return len(self._odometry[0]) > 0
 
     def events(self, start: float) -> Iterator[RawScan | RawOdometry]:
@@ -100,7 +100,7 @@ class CarmenLog:
 
 @dataclass(slots=True)
 class _Parsed:
-    """Lines of use, in file order."""
+    """Usable lines, in file order."""
 
     lasers: list[LaserLine] = field(default_factory=list)
     odometry: list[OdometryLine] = field(default_factory=list)
@@ -111,7 +111,7 @@ def read_carmen(path: Path) -> CarmenLog:
     """Read a CARMEN log (``.gz`` or not).
 
     Raises:
-        DeviceMissing, DeviceRefused: the file is not there or may not be read.
+        DeviceMissing, DeviceRefused: no such file, or no permission to read it.
         DataInvalid: no scan in it; names file, line and remedy.
     """
     report = LogReport()
@@ -162,7 +162,7 @@ def _parse_all(path: Path, report: LogReport) -> _Parsed:
 
 
 def _give_up(path: Path, number: int, parsed: _Parsed, problem: LineProblem) -> None:
-    """Another kind of file shows in its first thousand lines: say so before reading gigabytes."""
+    """Refuse another kind of file after its first thousand lines, before reading gigabytes."""
     if number >= _GIVE_UP_LINES and not (parsed.lasers or parsed.odometry or parsed.parameters):
         raise DataInvalid(f"{path}:{number}", f"not a CARMEN log: {problem}", _REMEDY)
 
@@ -183,18 +183,18 @@ def _note_file(path: Path, number: int, torn: Torn, parsed: _Parsed, report: Log
 
 
 def _usable(lasers: list[LaserLine], report: LogReport) -> list[LaserLine]:
-    """Drop old-style scans whose beam count neither is the log's usual one nor says its own geometry."""
+    """Drop old-style scans with an unusual beam count and no geometry of their own."""
     counts = Counter(line.setup.count for line in lasers)
     usual = counts.most_common(1)[0][0] if counts else 0
     used: list[LaserLine] = []
     for index, line in enumerate(lasers):
-        if line.setup.count == usual or beam_rule(line.setup)[2]:
+        if line.setup.count == usual or beam_geometry(line.setup)[2]:
             used.append(line)
         else:
             report.skip(
                 index + 1, f"{line.setup.count} beams where the log's laser has {usual} (numbers count laser lines)"
             )
-    if used and not beam_rule(used[0].setup)[2]:
+    if used and not beam_geometry(used[0].setup)[2]:
         report.notes.append(f"the log does not say where its {usual} beams point: 180 deg from -90 deg is assumed")
     return used
 
@@ -221,7 +221,7 @@ def _separate_odometry(readings: list[OdometryLine], origin: float) -> tuple[Arr
 def _odometry(
     lasers: list[LaserLine], time: Array, separate: tuple[Array, Array], report: LogReport
 ) -> tuple[Array, Array]:
-    """Time and poses of the wheel odometry: from the laser lines, where it holds at the scan's own stamp, else ODOM."""
+    """Time and poses of the wheel odometry: from the laser lines (true at the scan's stamp), else from ODOM lines."""
     posed = np.array([line.robot is not None for line in lasers])
     poses = np.array([line.robot for line in lasers if line.robot is not None]).reshape(-1, 3)
     if _moves(poses):

@@ -1,4 +1,4 @@
-"""One line of a CARMEN log to numbers: the text format only, no I/O, no judgement across lines.
+"""Parses one line of a CARMEN log: the text format only, no I/O, nothing across lines.
 
 Formats as the logger itself writes them at the head of a log (carmen.sourceforge.net/logger_playback.html)::
 
@@ -30,7 +30,7 @@ OTHER_KINDS: Final = frozenset(
     b"SYNC TRUEPOS RLASER LASER3 LASER4 LASER5 RAWLASER2 RAWLASER3 RAWLASER4 RAWLASER5 ROBOTLASER2 "
     b"NMEAGGA NMEARMC GPGGA GPRMC MARKER NEFF".split()
 )
-"""Kinds the format knows and this player has no use for (second lasers, GPS, ground truth of a simulator)."""
+"""Kinds of the format that the player does not use (second lasers, GPS, ground truth of a simulator)."""
 
 
 class LineProblem(Exception):
@@ -39,7 +39,7 @@ class LineProblem(Exception):
 
 @dataclass(frozen=True, slots=True)
 class LaserSetup:
-    """What a laser line says about its laser; NaN where it does not. Radians and metres.
+    """The laser's setup in a laser line; NaN where it is missing. Radians and metres.
 
     Attributes:
         count: beams. start: bearing of the first. fov, resolution: as written. maximum: range that means no return.
@@ -57,8 +57,8 @@ class LaserLine:
     """A scan: ranges in metres, poses in the odometry frame, ``stamp`` in seconds.
 
     Attributes:
-        laser, robot: first and second pose triple; None where the line has none or it is not finite.
-        remission: one value per beam, empty where there is none. Arrays, because a whole log of them is held at once.
+        laser, robot: first and second pose triple; None where missing or not finite.
+        remission: one value per beam, empty where missing. Arrays, since a whole log is in memory at once.
     """
 
     setup: LaserSetup
@@ -89,10 +89,10 @@ Line = LaserLine | OdometryLine | ParameterLine
 
 
 def parse(line: bytes) -> Line | None:
-    """One line to its numbers; None for blank lines, comments and kinds that are of no use here.
+    """Parse one line; None for blank lines, comments and unused kinds.
 
     Raises:
-        LineProblem: a kind that is used, but not written as it must be; or a kind nobody knows.
+        LineProblem: a malformed line of a used kind, or an unknown kind.
     """
     words = line.split()
     if not words or words[0][:1] in (b"#", b"%", b'"'):
@@ -120,7 +120,7 @@ def _count(word: bytes) -> int:
 
 
 def _stamp(words: list[bytes], at: int) -> float:
-    """The ipc time; a line must end after it, its host and the logger's time, or it was cut or run together."""
+    """The ipc time; host and logger's time must end the line after it, else lines were cut or joined."""
     if len(words) != at + _TAIL:
         raise ValueError(f"{len(words)} fields where {at + _TAIL} belong")
     stamp = float(words[at])
@@ -130,7 +130,7 @@ def _stamp(words: list[bytes], at: int) -> float:
 
 
 def _pose(values: list[float]) -> Pose | None:
-    """Three numbers as a pose, or None where one is not finite: such a line still has a scan."""
+    """Three numbers as a pose; None where one is not finite (the line's scan is still used)."""
     return (values[0], values[1], values[2]) if all(map(math.isfinite, values)) else None
 
 
@@ -161,12 +161,12 @@ def _configured(words: list[bytes]) -> tuple[LaserSetup, array[float], int]:
 def _remissions(words: list[bytes], at: int, rest: tuple[int, ...]) -> tuple[array[float], int]:
     """Remission values and the next index.
 
-    Old logs leave out even the count of remissions; a count has no decimal point, a pose has.
+    Old logs omit the count of remissions. A count has no decimal point, a pose has.
 
     Args:
         words: the line.
         at: index after the ranges.
-        rest: how many fields may follow before the three last ones.
+        rest: possible numbers of fields before the three last ones.
     """
     after = len(words) - at - _TAIL
     if words[at].isdigit():
@@ -193,7 +193,7 @@ def _rawlaser(words: list[bytes]) -> LaserLine:
 
 
 def _whole(remission: array[float], setup: LaserSetup) -> array[float]:
-    """Remissions are of use only where every beam has one."""
+    """Remissions, if every beam has one; else none."""
     return remission if len(remission) == setup.count else array("d")
 
 

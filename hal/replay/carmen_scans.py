@@ -1,4 +1,4 @@
-"""Ranges of a CARMEN log, metres as text, to a lidar's device units with the geometry the log implies."""
+"""Converts the ranges of a CARMEN log (m) to a lidar's device units, with the geometry that the log implies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from hal.lidar import VALID, LidarGeometry
 from hal.replay.carmen_lines import LaserLine, LaserSetup
-from hal.replay.geometry_guess import beam_rule, no_return, whole_step
+from hal.replay.geometry_guess import beam_geometry, no_return, whole_step
 from hal.replay.report import LogReport
 
 Array = npt.NDArray[np.float64]
@@ -23,13 +23,13 @@ PARAM_MODEL: Final = "lumiloop_laser_model"
 PARAM_DMIN: Final = "lumiloop_laser_dmin"
 PARAM_PERIOD: Final = "lumiloop_laser_period"
 PARAM_BEAM_DT: Final = "lumiloop_laser_beam_dt"
-"""Parameters of our own that a converted log may carry: text, metres, seconds, seconds between beams."""
+"""Parameters that `tools.convert` adds to a log: text, metres, seconds, seconds between beams."""
 
 PARAM_MAXIMUM: Final = "robot_front_laser_max"
 _PART: Final = 256
-"""Scans that are turned into whole numbers at a time."""
+"""Scans converted at a time, which bounds the memory."""
 _FARTHEST: Final = 1_000_000
-"""One kilometre in range units; what is beyond is no distance of any indoor lidar, whatever the log says."""
+"""One kilometre in range units; a longer value is no distance of an indoor lidar."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +41,7 @@ class CarmenScan:
     intensity: Whole | None
 
     def beams(self) -> tuple[Whole, Whole]:
-        """Ranges and codes; made anew by each call, so that a log in memory holds one number a beam."""
+        """Ranges and codes; computed on each call, so that a log in memory holds one number per beam."""
         valid = (self.raw >= self.geometry.dmin) & (self.raw <= self.geometry.dmax)
         return np.where(valid, self.raw, np.int32(0)), np.where(valid, np.int32(VALID), self.raw)
 
@@ -53,7 +53,7 @@ def convert(lasers: list[LaserLine], parameters: dict[str, str], time: Array, re
         lasers: laser lines in file order.
         parameters: the log's parameters.
         time: monotone time of each line, for the period.
-        report: gets the counts of beams.
+        report: receives the counts of beams.
     """
     by_setup: dict[LaserSetup, list[int]] = {}
     for index, line in enumerate(lasers):
@@ -76,7 +76,7 @@ def _intensity(remission: array[float]) -> Whole | None:
 
 
 def _raw(ranges: list[array[float]], count: int) -> Whole:
-    """Ranges of one laser, a row a scan, (n, count); a part at a time, so that nothing else as large comes to be."""
+    """Ranges of one laser, a row per scan, (n, count); converted in parts to bound the memory."""
     raw = np.empty((len(ranges), count), np.int32)
     for first in range(0, len(ranges), _PART):
         raw[first : first + _PART] = _millimetres(np.array(ranges[first : first + _PART]))
@@ -84,7 +84,7 @@ def _raw(ranges: list[array[float]], count: int) -> Whole:
 
 
 def _millimetres(metres: Array) -> Whole:
-    """NaN, infinity and negative readings become 0, which is below every laser's least distance."""
+    """Metres to range units; NaN, infinity and negative values become 0, below every laser's least distance."""
     usable = np.isfinite(metres) & (metres > 0.0)
     return np.rint(np.where(usable, np.minimum(metres / UNIT_M, 2.0 * _FARTHEST), 0.0)).astype(np.int32)
 
@@ -98,7 +98,7 @@ def _number(parameters: dict[str, str], name: str, otherwise: float) -> float:
 
 
 def _geometry(setup: LaserSetup, raw: Whole, parameters: dict[str, str], usual_period: float) -> LidarGeometry:
-    start, step, _ = beam_rule(setup)
+    start, step, _ = beam_geometry(setup)
     dmin = max(1, round(_number(parameters, PARAM_DMIN, UNIT_M) / UNIT_M))
     limits = [no_return(raw, UNIT_M, math.nan), no_return(raw, UNIT_M, setup.maximum)]
     limits.append(no_return(raw, UNIT_M, _number(parameters, PARAM_MAXIMUM, math.nan)))

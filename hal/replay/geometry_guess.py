@@ -1,4 +1,4 @@
-"""What a log does not say about its laser, worked out from what it does say: beam geometry and the no-return range."""
+"""Infers a laser's beam geometry and no-return range from a log that does not give them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from hal.replay.carmen_lines import LaserSetup
 
 SICK_CODES_M: Final = (81.83, 81.92)
-"""SICK LMS 2xx telegrams say 0x1FF7 to 0x1FFF (8183 to 8191 cm) for no return, dazzling and other non-distances."""
+"""SICK LMS 2xx telegrams: 0x1FF7 to 0x1FFF (8183 to 8191 cm) mean no return, dazzling and other non-distances."""
 
 _KNOWN_FOV_DEG: Final = {
     401: (-50.0, 0.25),  # LMS 2xx at its finest: 100 deg
@@ -21,18 +21,18 @@ _KNOWN_FOV_DEG: Final = {
     761: (-95.0, 0.25),  # UXM-30LX
 }
 FINEST_RAD: Final = 1e-4
-"""Least angle between beams that is believed."""
+"""Least plausible angle between beams."""
 _PILE_SHARE: Final = 1e-4
 _PILE_HEIGHT: Final = 10.0
 _PILE_DEPTH_M: Final = 1.0
 
 
-def beam_rule(setup: LaserSetup) -> tuple[float, float, bool]:
+def beam_geometry(setup: LaserSetup) -> tuple[float, float, bool]:
     """``(start, step, sure)``: bearing of the first beam and angle between beams, rad, counter-clockwise positive.
 
-    A line with a setup of its own says both. `FLASER` says only the number of beams: the lasers that wrote it cover
-    180 deg from -90 deg with whole fractions of a degree, so an odd number spans the half circle and an even number
-    lacks the last beam: 180 and 181 are 1.0 deg, 360 and 361 are 0.5 deg. ``sure`` is False where that is a guess.
+    A line with a setup gives both. `FLASER` gives only the number of beams. Its lasers cover 180 deg from -90 deg with
+    whole fractions of a degree: an odd number of beams spans the half circle, an even number lacks the last beam. 180
+    and 181 are 1.0 deg, 360 and 361 are 0.5 deg. ``sure`` is False where this is a guess.
     """
     if abs(setup.start) <= 2.0 * math.pi and FINEST_RAD <= setup.resolution <= math.pi:
         return setup.start, _step(setup), True
@@ -44,9 +44,9 @@ def beam_rule(setup: LaserSetup) -> tuple[float, float, bool]:
 
 
 def _step(setup: LaserSetup) -> float:
-    """The field of view over the beams, if that explains the written resolution.
+    """Field of view divided by the beams, if it agrees with the written resolution.
 
-    Six written decimals of a step, summed over a thousand beams, are off by a tenth of a beam's width.
+    A step with six decimals, summed over a thousand beams, is off by a tenth of a beam's width.
     """
     spans = [setup.fov / n for n in (setup.count - 1, setup.count) if n > 0 and math.isfinite(setup.fov)]
     near = min(spans, key=lambda step: abs(step - setup.resolution), default=math.inf)
@@ -54,7 +54,7 @@ def _step(setup: LaserSetup) -> float:
 
 
 def whole_step(start: float, step: float) -> float:
-    """Index of the beam that would point to the front; snapped to a whole one within the rounding of written angles."""
+    """Index of the beam to the front, rounded to a whole one within the rounding of written angles."""
     front = -start / step
     return float(round(front)) if abs(front - round(front)) < 1e-3 else front
 
@@ -62,8 +62,8 @@ def whole_step(start: float, step: float) -> float:
 def no_return(ranges: npt.NDArray[np.int32], unit_m: float, declared: float) -> int | None:
     """Smallest value, in range units, that means "no return"; None where every value looks like a distance.
 
-    A declared maximum counts. Without one, the largest value does if it is a pile: the same number again and again,
-    with next to nothing in the metre below it. A real wall spreads over the range noise, a code does not.
+    A declared maximum counts. Without one the largest value counts if it is frequent, with hardly any value in the
+    metre below it. A real wall spreads over the range noise, a code does not.
 
     Args:
         ranges: all readings of one laser.

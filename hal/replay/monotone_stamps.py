@@ -1,9 +1,9 @@
-"""A monotone time for records whose stamps are not: logs are played in file order, whatever their clock did.
+"""Repairs stamps that do not increase, so that a log can be played in file order.
 
-Two defects are told apart. *Scatter*: stamps that step back by a little because several processes, or a later
-reconstruction, wrote them; the order of the file is right and the stamps are noisy, so the least-squares increasing
-sequence (isotonic regression) is the time that explains them best. *A restarted clock*: a step that no scatter
-explains; what follows is shifted so that it continues where the log stopped. The original stamps stay with the records.
+Two defects are distinguished. *Scatter*: small backward steps, because several processes or a later reconstruction
+wrote the stamps. The file order is right and the stamps are noisy; the time is the least-squares increasing sequence
+(isotonic regression). *A restarted clock*: a step too large for scatter. The following stamps are shifted so that they
+continue the log. The records keep their original stamps.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ BACK_S: Final = 5.0
 """A step back by more than this is a restarted clock, not scatter (real logs scatter by up to about a second)."""
 
 AHEAD_S: Final = 3600.0
-"""A step ahead by more than this is a clock that was set."""
+"""A forward step by more than this is a clock that was set."""
 
 GAP_S: Final = 1e-3
-"""The least distance between two records of one stream; a scan takes longer than this."""
+"""Least interval of two records of one stream; a scan takes longer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,7 @@ def monotone(stamps: Array, origin: float) -> Monotone:
 
 
 def _bridge(stamps: Array, restart: npt.NDArray[np.bool_]) -> tuple[Array, int]:
-    """Shift what follows each restart so that it continues one usual step after what came before."""
+    """Shift the stamps after each restart to one usual step after their predecessor."""
     count = int(np.count_nonzero(restart))
     if count == 0:
         return stamps, 0
@@ -75,8 +75,8 @@ def _bridge(stamps: Array, restart: npt.NDArray[np.bool_]) -> tuple[Array, int]:
 def _isotonic(stamps: Array) -> Array:
     """Isotonic regression by pooling adjacent violators; a pool is then spread evenly towards its neighbours.
 
-    Without the spreading a pool would be one instant shared by several scans, and every velocity in it infinite. The
-    result stays between the largest stamp so far and the smallest to come: no time moves further than the disorder.
+    Without the spreading several scans would share one instant, with infinite velocities. Each result lies between the
+    largest stamp before it and the smallest after it: no time moves further than the disorder.
     """
     if np.all(np.diff(stamps) > 0.0):
         return stamps

@@ -1,8 +1,7 @@
-"""Where a log's laser sits on its robot.
+"""Mount of a log's laser on its robot.
 
-A laser line carries the pose of the laser and the pose of the robot in the same frame; their difference is the mount,
-and must be the same on every line. Where it is not, the first pose is no wheel odometry (a log that somebody has
-corrected), and the parameters of the logged system are asked instead.
+A laser line carries the poses of laser and robot in one frame. Their difference is the mount, equal on every line.
+Where it varies, the first pose is a corrected pose and not wheel odometry; the log's parameters give the mount then.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _MOST: Final = 0.99
 
 
 def log_mount(lasers: list[LaserLine], parameters: dict[str, str], report: LogReport) -> Mount:
-    """(x, y, yaw) of the laser on the robot in m and rad; says in ``report`` where it is not certain."""
+    """(x, y, yaw) of the laser on the robot in m and rad; ``report`` notes an uncertain one."""
     stated = _stated(parameters)
     measured = _differences(lasers)
     if len(measured) == 0:
@@ -76,6 +75,6 @@ def _outliers(measured: Array, middle: Array) -> npt.NDArray[np.bool_]:
 
 
 def _tidy(middle: Array) -> Mount:
-    """Six written decimals leave rounding of a few micrometres: no more digits than are known, and no minus zero."""
+    """Round to 10 um and 10 urad, the accuracy of six written decimals, without a negative zero."""
     x, y, yaw = (round(float(value), 5) + 0.0 for value in middle)
     return x, y, yaw

@@ -1,7 +1,7 @@
-"""Plays a log's records as devices: a lidar and an odometry source that share one order of events.
+"""Plays a log's records as devices: a lidar and an odometry source with one common order of events.
 
-Under the virtual loop a log plays as fast as its consumer can; under a real loop it plays in its own time. The order of
-the file is kept: an odometry reading with the same time as a scan comes before it.
+Under the virtual loop a log plays at its consumer's speed, under a real loop in its own time. File order is kept: an
+odometry reading with the same time as a scan precedes it.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
 from hal.odometry import RawOdometry
 
 LEAD_S: Final = 1.0
-"""Time between the start of the player and the first record, so that every consumer is listening."""
+"""Time from the player's start to the first record, so that every consumer is ready."""
 
 
 class Log(Protocol):
-    """A log that has been read."""
+    """A log in memory."""
 
     @property
     def geometry(self) -> LidarGeometry:
@@ -36,7 +36,7 @@ class Log(Protocol):
 
 
 class LogPlayer:
-    """One log as two devices: :attr:`lidar` drives the time, :attr:`odometry` listens along."""
+    """One log as two devices: :attr:`lidar` drives the time, :attr:`odometry` follows it."""
 
     def __init__(self, log: Log) -> None:
         self.lidar: Final = _LogLidar(log, self)
@@ -90,23 +90,23 @@ class _LogLidar:
 
 
 class _LogOdometry:
-    """The odometry of a log (`hal.odometry.OdometrySource`); it moves when the log's lidar runs."""
+    """The odometry of a log (`hal.odometry.OdometrySource`); it delivers while the log's lidar runs."""
 
     def __init__(self) -> None:
         self._listeners: list[Callable[[RawOdometry], None]] = []
         self._finished = asyncio.Event()
 
     def deliver(self, reading: RawOdometry) -> None:
-        """Hand a reading to whoever runs this source."""
+        """Pass a reading to the consumers of this source."""
         for listener in self._listeners:
             listener(reading)
 
     def finish(self) -> None:
-        """Let `run` return."""
+        """End every `run`."""
         self._finished.set()
 
     async def run(self, on_odometry: Callable[[RawOdometry], None]) -> None:
-        """Deliver readings until the log's lidar has come to its end."""
+        """Deliver readings until the log ends."""
         self._listeners.append(on_odometry)
         try:
             await self._finished.wait()

@@ -1,4 +1,4 @@
-r"""Our own recording: a folder of append-only segments that survive a power cut up to their last whole record.
+r"""The lumiloop recording: a folder of append-only segments, readable after a power cut up to the last whole record.
 
 Segment file ``NNNNNN.lumirec``, all numbers little-endian:
 
@@ -6,8 +6,8 @@ Segment file ``NNNNNN.lumirec``, all numbers little-endian:
 * records: marker 0xA5 0x5A, kind (u8), channel (u8), payload length (u32), ``t_mono`` (f64), CRC-32 (u32) of
   kind to ``t_mono`` and payload, payload.
 
-The header repeats in every segment, so that each can be read alone. Nothing in a segment is ever changed after it was
-written: what a torn end or a damaged place still holds is found again by the markers and proved by the CRC.
+Every segment repeats the header, so that each can be read alone. Written bytes are never changed. After a truncated or
+damaged record the reader finds the next one by its marker and verifies it by its CRC.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from hal.replay.text import unreadable
 
 MAGIC: Final = b"LUMIREC\n"
 VERSION: Final = 2
-"""Version 2 added SAMPLES, and lights in the header; what version 1 wrote reads as it did."""
+"""Version 2 adds SAMPLES, and lights in the header; version 1 is read, too."""
 SUFFIX: Final = ".lumirec"
 STATE_SUFFIX: Final = ".lumistate"
 MARKER: Final = b"\xa5\x5a"
 LONGEST: Final = 1 << 20
-"""No record is longer; a length beyond it is damage."""
+"""Longest payload; a larger length is damage."""
 
 _SHORT: Final = 4096
 _START: Final = struct.Struct("<8sHI")
@@ -52,15 +52,15 @@ _SAMPLES: Final = struct.Struct("<q5dBxHI")
 
 
 class Kind(IntEnum):
-    """What a record is. Numbers are part of the format: never renumber."""
+    """Kind of a record. The numbers are part of the format: never renumber."""
 
     RX = 1  # bytes from a device, as they arrived
     TX = 2  # bytes to a device
     OPEN = 3  # a port was opened; payload: its name and rate as text
     LOST = 4  # a port was lost; payload: why
     BAUD = 5  # the line rate was changed; payload: the new rate as text
-    SCAN = 8  # a scan the driver delivered: which, and when it was measured
-    SAMPLES = 9  # a block of conversions as the photodiode's driver delivered it
+    SCAN = 8  # a scan of the driver: number and times; its ranges are in RX
+    SAMPLES = 9  # a sample block of the photodiode's driver
     ODOMETRY = 16
     IMU = 17
     COMMAND = 18
@@ -80,7 +80,7 @@ LAYOUTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One record; ``channel`` tells devices of one kind apart (0: the lidar)."""
+    """One record; ``channel`` distinguishes devices of one kind (0: the lidar)."""
 
     kind: int
     channel: int
@@ -103,7 +103,7 @@ def pack_frame(kind: int, channel: int, t_mono: float, payload: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class ScanMark:
-    """A scan as the driver delivered it; its ranges are in the bytes. Fields as in `hal.lidar.RawScan`."""
+    """Number and times of a delivered scan; its ranges are in the RX bytes. Fields as in `hal.lidar.RawScan`."""
 
     seq: int
     t_rx: float
@@ -163,17 +163,17 @@ def segment_name(number: int) -> str:
 
 
 def state_name(number: int) -> str:
-    """File name of the state that the ``number``-th segment can be replayed from, where there is one beside it."""
+    """File name of the estimator state at the start of the ``number``-th segment, if one was saved."""
     return f"{number:06d}{STATE_SUFFIX}"
 
 
 def segments_of(folder: Path) -> list[Path]:
     """Segments of a recording in order.
 
-    A single segment file is a recording too; a folder that holds one recording's folder stands for it.
+    A single segment file is a recording, too; a folder with exactly one recording's folder stands for it.
 
     Raises:
-        DeviceMissing, DeviceRefused: there is nothing, or it may not be read.
+        DeviceMissing, DeviceRefused: no such path, or no permission to read it.
         DataInvalid: the folder holds several recordings.
     """
     try:
@@ -202,10 +202,10 @@ class Recording:
     header: dict[str, Any]
     segments: tuple[Path, ...]
     first: int = 0
-    """Number of the segment that it begins with."""
+    """Number of its first segment."""
 
     def frames(self, report: LogReport) -> Iterator[Frame]:
-        """Every whole record in order; what is torn or damaged is counted in ``report``, with its place.
+        """Every whole record in order; truncated and damaged ones are counted in ``report`` with their place.
 
         Raises:
             DeviceRefused: a segment cannot be read.
@@ -235,7 +235,7 @@ def open_recording(path: Path) -> Recording:
     """Find the segments of a recording and read its header.
 
     Raises:
-        DeviceMissing, DeviceRefused: nothing there, or it may not be read.
+        DeviceMissing, DeviceRefused: no such path, or no permission to read it.
         DataInvalid: no segment has a readable head, or a newer version wrote it.
     """
     segments = segments_of(path)
@@ -251,12 +251,14 @@ def open_recording(path: Path) -> Recording:
 
 
 def header_of(segment: Path) -> dict[str, Any] | None:
-    """A segment's header, and no more of it is read; None where it cannot be read, or is damaged."""
+    """A segment's header, without reading the records; None where unreadable or damaged."""
     try:
         with segment.open("rb") as file:
             start = file.read(_START.size)
             whole = len(start) == _START.size and start.startswith(MAGIC)
-            length = min(_START.unpack(start)[2], segment.stat().st_size) if whole else 0  # a damaged one asks for all
+            length = (
+                min(_START.unpack(start)[2], segment.stat().st_size) if whole else 0
+            )  # a damaged length may exceed the file
             rest = file.read(length + _CRC.size)
     except OSError:
         return None
@@ -285,7 +287,7 @@ def _check_version(path: Path, data: bytes) -> None:
 
 
 def _read_head(data: bytes) -> tuple[dict[str, Any] | None, int]:
-    """The header and where the records begin; None where it is damaged."""
+    """The header and the offset of the first record; None where the head is damaged."""
     if len(data) < _START.size or not data.startswith(MAGIC):
         return None, 0
     end = _START.size + _START.unpack_from(data)[2]
@@ -293,7 +295,7 @@ def _read_head(data: bytes) -> tuple[dict[str, Any] | None, int]:
         return None, 0
     try:
         header = json.loads(data[_START.size : end])
-    except (ValueError, RecursionError):  # the sum is right, and yet it is no JSON: not ours
+    except (ValueError, RecursionError):  # a valid CRC over something else than JSON
         return None, 0
     return (header, end + _CRC.size) if isinstance(header, dict) else (None, 0)
 
@@ -325,10 +327,10 @@ def _frame_at(data: bytes, at: int) -> tuple[Frame | None, int]:
 
 
 def _next_frame(data: bytes, at: int) -> int:
-    """Where the next whole record begins, or the end of the data.
+    """Offset of the next whole record, or the end of the data.
 
-    Of long ones only those are tried after which there is another one or nothing: the sums of all that may look like
-    one in some megabytes of markers and lengths would take hours.
+    A long candidate is verified only if a marker or the end of the data follows it: megabytes of accidental markers
+    would otherwise take hours of CRC computation.
     """
     while (at := data.find(MARKER, at)) >= 0:
         if len(data) >= at + _HEAD.size:

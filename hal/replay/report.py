@@ -1,4 +1,4 @@
-"""What a reader had to skip or assume, in a form that both a person and `summary.json` can use."""
+"""The report of a log reader: used records, skipped records with reasons, assumptions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _LINES_KEPT: Final = 5
 
 @dataclass(slots=True)
 class Skipped:
-    """One reason for skipping: how often, and where first (line numbers, or byte offsets of a binary log)."""
+    """One reason for skipping: count and first places (line numbers, or byte offsets of a binary log)."""
 
     count: int = 0
     first: list[int] = field(default_factory=list)
@@ -21,7 +21,7 @@ class LogReport:
     """Findings of one reader.
 
     Attributes:
-        used: how many records of each kind were read. skipped: by reason. notes: one sentence each, worst first.
+        used: number of records read, by kind. skipped: by reason. notes: one sentence each, worst first.
     """
 
     used: dict[str, int] = field(default_factory=dict)
@@ -41,11 +41,11 @@ class LogReport:
 
     def sentences(self) -> list[str]:
         """Everything found, one sentence each, for a person."""
-        said = list(self.notes)
+        sentences = list(self.notes)
         for reason, entry in self.skipped.items():
             places = ", ".join(map(str, entry.first)) + (", ..." if entry.count > len(entry.first) else "")
-            said.append(f"skipped {entry.count}: {reason} (at {places})")
-        return said
+            sentences.append(f"skipped {entry.count}: {reason} (at {places})")
+        return sentences
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for `summary.json`."""

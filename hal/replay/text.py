@@ -1,4 +1,4 @@
-"""Lines of a text log, gzipped or not, read tolerantly: what a torn file still holds is delivered, the tear is said."""
+"""Reads the lines of a text log, gzipped or not; a truncated file yields its readable lines and the reason."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _LONGEST_LINE: Final = 1 << 22
 
 @dataclass(slots=True)
 class Torn:
-    """Set when a file ended before its own end: ``reason`` says how; empty otherwise."""
+    """Truncation of a compressed file: ``reason``; empty where the file is complete."""
 
     reason: str = ""
 
 
 def unreadable(path: Path, error: OSError) -> HalError:
-    """The device error for a file that cannot be read, with what a person can do about it."""
+    """The device error for an unreadable file, with a remedy."""
     if error.errno == errno.ENOENT:
         return DeviceMissing(str(path), "no such file", "check the path")
     if error.errno == errno.EISDIR:
@@ -36,10 +36,10 @@ def unreadable(path: Path, error: OSError) -> HalError:
 
 
 def head(path: Path, size: int = 4096) -> bytes:
-    """The first bytes of a file's content (inflated where it is gzip), for telling kinds of logs apart.
+    """The first bytes of a file's content (inflated where it is gzip), to distinguish kinds of logs.
 
     Raises:
-        DeviceMissing, DeviceRefused: as `unreadable` says.
+        DeviceMissing, DeviceRefused: see `unreadable`.
     """
     data = b""
     for chunk in _chunks(path, Torn(), min(size, _CHUNK)):
@@ -57,8 +57,8 @@ def lines(path: Path, torn: Torn) -> Iterator[tuple[int, bytes]]:
         torn: its ``reason`` is set when the compressed stream breaks off.
 
     Raises:
-        DeviceMissing, DeviceRefused: as `unreadable` says.
-        DataInvalid: a line longer than 4 MB, which no text log has.
+        DeviceMissing, DeviceRefused: see `unreadable`.
+        DataInvalid: a line longer than 4 MB: not a text log.
     """
     number = 0
     rest = b""
@@ -80,7 +80,9 @@ def _chunks(path: Path, torn: Torn, size: int) -> Iterator[bytes]:
             magic = raw.read(2)
             raw.seek(0)
             with gzip.GzipFile(fileobj=raw) as inflated:
-                read = inflated.read1 if magic == GZIP_MAGIC else raw.read  # read1: all there is before a tear
+                read = (
+                    inflated.read1 if magic == GZIP_MAGIC else raw.read
+                )  # read1: returns all data before the truncation
                 while chunk := read(size):
                     yield chunk
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:

@@ -1,1 +1,1 @@
-"""Robots of a fleet, over Zenoh: what each tells, all on one map, and a survey and a map that all of them share."""
+"""A fleet of robots over Zenoh: status of each robot, an overview on one map, distribution of survey and map."""

@@ -1,7 +1,7 @@
-"""A robot's name in the fleet belongs to one speaker: the one who took it first. Others wait, and say so.
+"""Exclusive claim of a robot's name in the fleet: the first claimant publishes, others wait.
 
-Speakers are liveliness tokens; the router takes away those of who has gone. After a partition two may have spoken for a
-name: the least token has the word then (`messages.instance_of`), the other one stops.
+Claims are liveliness tokens, which the router removes with their session. After a network partition two claimants may
+exist: the smallest token wins (`messages.instance_of`), the other one stops.
 """
 
 from __future__ import annotations
@@ -13,82 +13,81 @@ from typing import Final
 
 import zenoh
 
-from daemon.cli import parser
+from daemon.system import console
 from taps.fleet import messages
-from taps.zenoh_session import BEAT_S, Say, listed, withdraw
+from taps.zenoh_session import POLL_S, Say, list_tokens, undeclare
 
 ALONE_S: Final = 5.0
-"""A name is taken from nobody before its speaker has been gone for so long, with the router there: after a router's
-death some are back later than others."""
+"""A name is free after its claimant has been absent for this long with the router present: after a router restart some
+sessions return later than others."""
 SURE_S: Final = 1.0
-"""Two that join at once, or whose router has just come back, have heard of each other by then: before that none of them
-is said to be in the fleet."""
+"""Time after which two simultaneous claimants have seen each other; before it no claim is reported as successful."""
 
 
 class Claim:
-    """A name that is wanted.
+    """The claim of one name.
 
     Attributes:
-        mine: whether it is ours now.
+        mine: whether this process holds it.
 
     Args:
-        on_change: told when it becomes ours, and when it no longer is; in the loop's thread.
+        on_change: called in the loop's thread when the name is won or lost.
     """
 
     def __init__(
-        self, session: zenoh.Session, robot: str, host: str, on_change: Callable[[bool], None], say: Say = parser.say
+        self, session: zenoh.Session, robot: str, host: str, on_change: Callable[[bool], None], say: Say = console.say
     ) -> None:
         self.mine = False
         self._session, self._robot, self._host, self._on_change, self._say = session, robot, host, on_change, say
-        self._others: dict[str, bool] = {}  # whether it is there, as heard last
+        self._others: dict[str, bool] = {}  # whether it is present
         self._token: zenoh.LivelinessToken | None = None
         self._instance = ""
-        self._listening: zenoh.Subscriber[None] | None = None
-        self._said = False  # that it is ours
-        self._alone = 0.0  # s since when nobody has it before us, or since it was settled whose it is
+        self._subscriber: zenoh.Subscriber[None] | None = None
+        self._reported = False  # that the claim succeeded
+        self._alone = 0.0  # s since no other claimant had precedence, or since the last decision
 
     async def run(self) -> None:
-        """Have the name whenever nobody else has it, until cancelled."""
+        """Hold the name whenever no other process does, until cancelled."""
         try:
             await self._begin()
             while True:
-                await asyncio.sleep(BEAT_S)
+                await asyncio.sleep(POLL_S)
                 free = not self._before() and bool(self._session.info.routers_zid())
-                self._alone = self._alone + BEAT_S if free else 0.0
-                if self.mine and not self._said and self._alone >= SURE_S:
-                    self._said = True
+                self._alone = self._alone + POLL_S if free else 0.0
+                if self.mine and not self._reported and self._alone >= SURE_S:
+                    self._reported = True
                     self._say(f"{self._robot} is in the fleet")
                 elif self._alone >= ALONE_S and not self.mine:
                     self._settle(True)
         finally:
-            if self._listening is not None:
-                withdraw(self._listening)
+            if self._subscriber is not None:
+                undeclare(self._subscriber)
             self._put(None)
 
     async def _begin(self) -> None:
-        """Who is there already is before us, whatever clocks say."""
+        """Declare the claim, after those already present, whatever their clocks."""
         everybody = messages.alive(self._robot, "*")
         loop = asyncio.get_running_loop()
 
-        def heard(sample: zenoh.Sample) -> None:
+        def on_token(sample: zenoh.Sample) -> None:
             there = sample.kind == zenoh.SampleKind.PUT
             instance = str(sample.key_expr).rpartition("/")[2]
-            with contextlib.suppress(RuntimeError):  # the loop has closed: nobody claims it any more
-                loop.call_soon_threadsafe(self._heard, instance, there)
+            with contextlib.suppress(RuntimeError):  # the loop has closed
+                loop.call_soon_threadsafe(self._on_claim, instance, there)
 
-        # before the list is asked for: who leaves in the meantime would be in it for ever
-        self._listening = self._session.liveliness().declare_subscriber(everybody, heard, history=True)
-        for name in await listed(self._session, everybody):
+        # before the list is queried: a claimant that leaves meanwhile would stay in it
+        self._subscriber = self._session.liveliness().declare_subscriber(everybody, on_token, history=True)
+        for name in await list_tokens(self._session, everybody):
             self._others.setdefault(name.rpartition("/")[2], True)
         there = [one for one, is_there in self._others.items() if is_there]
         claimed = max([messages.now_ms(), *(messages.claimed_of(one) + 1 for one in there)])
         self._instance = messages.instance_of(str(self._session.info.zid()), self._host, claimed)
         self._settle(not self._before())
 
-    def _heard(self, instance: str, there: bool) -> None:
+    def _on_claim(self, instance: str, there: bool) -> None:
         if instance == self._instance:
             return
-        if there or not self._instance:  # while the list is awaited, who has gone must not come back by it
+        if there or not self._instance:  # the pending list must not restore a claimant that has left
             self._others[instance] = there
         else:
             self._others.pop(instance, None)
@@ -96,16 +95,16 @@ class Claim:
             self._settle(False)
 
     def _before(self) -> str:
-        """Who has the name before us; empty: nobody."""
+        """The claimant with precedence over this one; empty: none."""
         first = min((one for one, there in self._others.items() if there), default="")
         return first if first and first < self._instance else ""
 
     def _settle(self, mine: bool) -> None:
-        """The name is ours from now on, or is not."""
+        """Record that the name is won or lost."""
         self.mine, self._alone = mine, 0.0
         self._put(messages.alive if mine else messages.waiting)
         if not mine:
-            self._said = False
+            self._reported = False
             self._say(
                 f"the fleet has a robot {self._robot} already, on {messages.host_of(self._before())}; this one, on "
                 f"{self._host}, tells nothing until that one has gone: give one of them another `name`"
@@ -113,10 +112,10 @@ class Claim:
         self._on_change(mine)
 
     def _put(self, place: Callable[[str, str], str] | None) -> None:
-        """The token that says how it is."""
+        """Replace the liveliness token; None: remove it."""
         old = self._token
         self._token = None
         if place is not None:
             self._token = self._session.liveliness().declare_token(place(self._robot, self._instance))
         if old is not None:
-            withdraw(old)
+            undeclare(old)

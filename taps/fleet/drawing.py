@@ -1,4 +1,4 @@
-"""The fleet on one map: as text for a terminal, as a picture."""
+"""Draws the fleet on one map, as text for a terminal or as an image."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from taps.stream.tiles import FREE, UNSEEN, WALL
 
 LABELS: Final = "123456789abcdefghijklmnopqrstuvwxyz"
 TALL: Final = 2.0
-"""A character is so many times taller than wide."""
+"""Height of a character over its width."""
 SMALLEST_SIDE: Final = 800
-"""Cells are drawn larger until the longer side has about this many pixels."""
+"""Cells are enlarged until the longer side has about this many pixels."""
 DISC_PX: Final = 9
 WIDEST: Final = 200
-"""Characters of a cell of the table: who writes more has nothing to say."""
+"""Most characters in a cell of the table."""
 SHADES: Final = {UNSEEN: (205, 211, 220), FREE: (255, 255, 255), WALL: (28, 34, 48)}
 COLOURS: Final = (
     ("blue", (37, 99, 235)),
@@ -35,7 +35,7 @@ HEADS: Final = ("", "robot", "state", "x m", "y m", "deg", "bound m", "map", "su
 
 
 def table(members: Sequence[Member], now: float) -> list[str]:
-    """A line for each robot, and one above."""
+    """The table of robots: a header and a line for each."""
     told = (_row(label_of(k), member, now) for k, member in enumerate(members))
     rows = [HEADS, *(tuple(printable(cell[:WIDEST]) for cell in row) for row in told)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(HEADS))]
@@ -43,7 +43,7 @@ def table(members: Sequence[Member], now: float) -> list[str]:
 
 
 def label_of(place: int) -> str:
-    """One character for a robot; those beyond the last one share it."""
+    """One-character label of a robot; the last label is shared."""
     return LABELS[min(place, len(LABELS) - 1)]
 
 
@@ -55,7 +55,7 @@ def _row(label: str, member: Member, now: float) -> tuple[str, ...]:
     at = (member.pose.agvPosition if member.pose is not None else None) or {}
     bound = number(at.get("deviationRange"))
     survey = None if state is None else state.held.get("survey")
-    said = "GONE" if not member.speakers else "?" if state is None else state.state_name
+    said = "GONE" if not member.publishers else "?" if state is None else state.state_name
     faults = () if state is None else state.faults
     words = "; ".join(f"{one.fault} {one.meaning}" for one in faults) or ("" if state is None else state.meaning)
     return (
@@ -68,13 +68,13 @@ def _row(label: str, member: Member, now: float) -> tuple[str, ...]:
         "-" if bound is None else f"{bound:.2f}",
         member.map_id or "-",
         "-" if survey is None else str(survey.version),
-        f"{now - member.t_heard:.0f}" if math.isfinite(member.t_heard) else "-",
+        f"{now - member.t_message:.0f}" if math.isfinite(member.t_message) else "-",
         words,
     )
 
 
 def on_chart(chart: Chart, members: Sequence[Member]) -> list[tuple[int, Member, float, float]]:
-    """Robots whose place is meant in this map: number in the table, robot, row and column of its cell."""
+    """Robots with a pose in this map: number in the table, robot, row and column of its cell."""
     head, cells = chart
     found = []
     for k, member in enumerate(members):
@@ -97,7 +97,7 @@ def plan(chart: Chart, members: Sequence[Member], wide: int = 100, high: int = 3
     text = np.full((rows, columns), " ")
     at_row, first_row = _starts(last - first, TALL * step)
     at_column, first_column = _starts(right - left, step)
-    for shade, letter in ((FREE, "."), (WALL, "#")):  # a wall in a field counts more than much free floor
+    for shade, letter in ((FREE, "."), (WALL, "#")):  # a wall takes precedence over free cells
         there = np.logical_or.reduceat(np.logical_or.reduceat(cells == shade, first_row, 0), first_column, 1)
         text[np.ix_(at_row, at_column)] = np.where(there, letter, text[np.ix_(at_row, at_column)])
     for k, _, row, column in robots:
@@ -110,7 +110,7 @@ def plan(chart: Chart, members: Sequence[Member], wide: int = 100, high: int = 3
 
 
 def picture(chart: Chart, members: Sequence[Member]) -> tuple[npt.NDArray[np.uint8], list[str]]:
-    """RGB pixels (rows, columns, 3), top row first; and which colour is which robot."""
+    """RGB pixels (rows, columns, 3), top row first; and the legend of colours."""
     _, cells = chart
     scale = max(1, round(SMALLEST_SIDE / max(cells.shape)))
     shades = np.empty((*cells.shape, 3), np.uint8)
@@ -130,7 +130,7 @@ def picture(chart: Chart, members: Sequence[Member]) -> tuple[npt.NDArray[np.uin
 
 
 def _seen(cells: Cells) -> tuple[tuple[int, int], tuple[int, int]]:
-    """First row and the one after the last, first column and the one after the last, of what is known."""
+    """Row range and column range of the known cells, ends excluded."""
     rows, columns = (np.nonzero((cells != UNSEEN).any(axis=axis))[0] for axis in (1, 0))
     if rows.size == 0:
         return (0, cells.shape[0]), (0, cells.shape[1])
@@ -138,7 +138,7 @@ def _seen(cells: Cells) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def _starts(cells: int, step: float) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Of fields that are ``step`` cells wide: those that any cell lies in, and the first cell of each."""
+    """Fields of ``step`` cells: the indices of those with cells, and the first cell of each."""
     fields, first = np.unique((np.arange(cells) / step).astype(np.intp), return_index=True)
     return fields, first
 

@@ -1,6 +1,6 @@
-"""What a robot tells its fleet: keys, and messages as JSON. Pure; docs/fleet.md is the contract.
+"""The fleet's protocol: Zenoh keys, and messages as JSON (docs/fleet.md). Pure.
 
-A field never changes its meaning under the same ``schema``; readers skip what they do not know.
+A field never changes its meaning under the same ``schema``; readers skip unknown fields.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from taps.stream.messages import Fault, Faults, Loop, Pose, Triple
+from daemon.publish.stream.messages import Fault, Faults, Loop, Pose, Triple
 
 SCHEMA: Final = 1
 ROOT: Final = "lumiloop"
 TOPICS: Final = ("pose", "state", "loops", "map")
 SHARED: Final = f"{ROOT}/@shared"
-"""No robot's name begins with @, and no ``*`` meets it."""
+"""No robot's name begins with @, and no ``*`` matches it."""
 MOST_CELLS: Final = 100_000_000
 LONGEST_NAME: Final = 32
-"""No robot's name is longer (key `name` of the configuration)."""
+"""Longest name of a robot (key `name` of the configuration)."""
 LONGEST: Final = 1 << 16
-"""Bytes of a message, but for a map's cells."""
+"""Most bytes of a message, without a map's cells."""
 Cells = npt.NDArray[np.int8]
-Told = TypeVar("Told", bound=msgspec.Struct)
+Message = TypeVar("Message", bound=msgspec.Struct)
 
 
 class Unreadable(Exception):
-    """A message that is not as it should be; the text says what is wrong."""
+    """An invalid message; the text gives the cause."""
 
 
-class PoseTold(msgspec.Struct, frozen=True, kw_only=True):
-    """Key ``pose``: where the robot is; ``agvPosition`` as VDA 5050 has it, None before the first pose."""
+class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """Key ``pose``: the robot's pose; ``agvPosition`` of VDA 5050, None before the first pose."""
 
     schema: int = SCHEMA
     seq: int
@@ -46,15 +46,15 @@ class PoseTold(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Held(msgspec.Struct, frozen=True):
-    """What a robot has taken of what its fleet shares."""
+    """A shared file that a robot has installed."""
 
     version: int
     sha256: str
     name: str = ""
 
 
-class StateTold(msgspec.Struct, frozen=True, kw_only=True):
-    """Key ``state``: how the robot is; ``up``: whether its daemon runs."""
+class StateMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """Key ``state``: the robot's state; ``up``: whether its daemon runs."""
 
     schema: int = SCHEMA
     t_utc: float
@@ -71,7 +71,7 @@ class StateTold(msgspec.Struct, frozen=True, kw_only=True):
     held: dict[str, Held] = {}
 
 
-class LoopTold(msgspec.Struct, frozen=True, kw_only=True):
+class LoopMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Key ``loops``: a loop closure."""
 
     schema: int = SCHEMA
@@ -83,7 +83,7 @@ class LoopTold(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapHead(msgspec.Struct, frozen=True, kw_only=True):
-    """Key ``map``, in the attachment: of cells that are deflated, row by row from below, signed bytes."""
+    """Key ``map``, the attachment; the content is the deflated cells, row by row from below, signed bytes."""
 
     schema: int = SCHEMA
     t_utc: float
@@ -95,44 +95,44 @@ class MapHead(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def key(robot: str, topic: str) -> str:
-    """Where a robot tells a topic."""
+    """Zenoh key of a robot's topic."""
     return f"{ROOT}/{robot}/{topic}"
 
 
 def alive(robot: str, instance: str) -> str:
-    """The liveliness token of who speaks for a robot."""
+    """Key of the liveliness token of a robot's publisher."""
     return f"{ROOT}/{robot}/alive/{instance}"
 
 
 def waiting(robot: str, instance: str) -> str:
-    """The liveliness token of who would speak for a robot, and waits because another does."""
+    """Key of the liveliness token of a claimant that waits for a robot's name."""
     return f"{ROOT}/{robot}/waiting/{instance}"
 
 
 def instance_of(session: str, host: str, claimed_ms: int) -> str:
-    """Who speaks for a robot: since when, in which session, on which computer. The least of several has the word."""
+    """ID of a claimant: time of the claim, session, host. The smallest of several has precedence."""
     return f"{claimed_ms:014d}.{session}.{re.sub(r'[^A-Za-z0-9_.-]', '-', host)}"
 
 
 def claimed_of(instance: str) -> int:
-    """Since when, ms since the Unix epoch; 0 where it is none of ours."""
+    """Time of a claim, ms since the Unix epoch; 0 for a foreign ID."""
     first = instance.partition(".")[0]
     return int(first) if first.isascii() and first.isdigit() else 0
 
 
 def host_of(instance: str) -> str:
-    """On which computer."""
+    """Host of a claimant."""
     return printable(instance.split(".", 2)[-1])
 
 
 def printable(text: str) -> str:
-    """Without what a terminal takes for orders."""
+    """Text without control characters for a terminal."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
-def state_told(pose: Pose, faults: Faults | None, held: dict[str, Held], map_name: str) -> StateTold:
-    """How a robot is, of what its daemon told last."""
-    return StateTold(
+def state_message(pose: Pose, faults: Faults | None, held: dict[str, Held], map_name: str) -> StateMessage:
+    """The state message for the latest stream messages."""
+    return StateMessage(
         t_utc=pose.utc(pose.t_mono),
         state=pose.state,
         state_name=pose.state_name,
@@ -147,17 +147,19 @@ def state_told(pose: Pose, faults: Faults | None, held: dict[str, Held], map_nam
     )
 
 
-def loop_told(loop: Loop, t_utc: float) -> LoopTold:
-    """A loop closure."""
-    return LoopTold(t_utc=t_utc, counter=loop.counter, residual=loop.residual, at_new=loop.at_new, at_old=loop.at_old)
+def loop_message(loop: Loop, t_utc: float) -> LoopMessage:
+    """The message of a loop closure."""
+    return LoopMessage(
+        t_utc=t_utc, counter=loop.counter, residual=loop.residual, at_new=loop.at_new, at_old=loop.at_old
+    )
 
 
-def encode(told: msgspec.Struct) -> bytes:
-    """As JSON."""
-    return msgspec.json.encode(told)
+def encode(message: msgspec.Struct) -> bytes:
+    """Encode as JSON."""
+    return msgspec.json.encode(message)
 
 
-def map_told(head: MapHead, cells: Cells) -> tuple[bytes, bytes]:
+def map_message(head: MapHead, cells: Cells) -> tuple[bytes, bytes]:
     """Content and attachment of a map."""
     return zlib.compress(cells.tobytes(), 6), encode(head)
 
@@ -166,7 +168,7 @@ def read_map(content: bytes, attachment: bytes) -> tuple[MapHead, Cells]:
     """A map: head, and (rows, columns) cells.
 
     Raises:
-        Unreadable: it is none.
+        Unreadable: not a valid map.
     """
     head = read(attachment, MapHead)
     if head.columns < 1 or head.rows < 1 or head.columns * head.rows > MOST_CELLS:
@@ -182,22 +184,22 @@ def read_map(content: bytes, attachment: bytes) -> tuple[MapHead, Cells]:
     return head, np.frombuffer(cells, np.int8).reshape(head.rows, head.columns)
 
 
-def read(data: bytes, kind: type[Told]) -> Told:
-    """A message.
+def read(data: bytes, kind: type[Message]) -> Message:
+    """Decode a message.
 
     Raises:
-        Unreadable: it is not one of that kind, or of another schema.
+        Unreadable: not a message of that kind, or of another schema.
     """
     if len(data) > LONGEST:
         raise Unreadable(f"a message of {len(data)} bytes, and none has more than {LONGEST}")
     try:
-        told = msgspec.json.decode(data, type=kind)
+        message = msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise Unreadable(f"no message of a lumiloop ({error})") from None
-    schema = getattr(told, "schema", SCHEMA)
+    schema = getattr(message, "schema", SCHEMA)
     if schema != SCHEMA:
         raise Unreadable(f"schema {schema}, and this program knows {SCHEMA}: install both from the same release")
-    return told
+    return message
 
 
 def now_ms() -> int:

@@ -1,6 +1,6 @@
-"""What a fleet shares, put to its place on a robot: checked before, never half written, never an older one.
+"""Installs shared surveys and maps on a robot: checked first, written atomically, never older than the present one.
 
-Nothing here knows Zenoh: offers and bytes in, files out.
+Independent of Zenoh: offers and bytes in, files out.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from daemon.maps.edit import keep
 from daemon.maps.schema import read
 from daemon.maps.store import Store
 from daemon.system.atomic_file import reason_of, write_whole
-from estimator.cdma.air_interface import PROFILES, Profile
-from estimator.light_filter.survey import Survey
+from estimator import PROFILES, Profile, Survey
 from taps.fleet.messages import SCHEMA, Held, printable
 
 SURVEY, MAP = "survey", "map"
@@ -33,15 +32,15 @@ KINDS: Final = (SURVEY, MAP)
 MOST_BYTES: Final = 256 << 20
 RECORD: Final = "fleet.json"
 BEFORE: Final = ".before"
-"""Behind the name of a survey that was replaced; and a number, from the second one on."""
+"""Suffix of a replaced survey, followed by a number from the second one on."""
 
 
 class Refused(Exception):
-    """It is not taken; the text says why and what to do."""
+    """A shared file that is not accepted; the text gives the cause and a remedy."""
 
 
 class Offer(msgspec.Struct, frozen=True, kw_only=True):
-    """What somebody shares, but for the content: key ``lumiloop/@shared/<kind>``.
+    """Description of a shared file, without its content: key ``lumiloop/@shared/<kind>``.
 
     ``version``: a larger one is newer. ``map_id``: of a map, else 0.
     """
@@ -54,21 +53,21 @@ class Offer(msgspec.Struct, frozen=True, kw_only=True):
     size: Annotated[int, Meta(ge=0, le=MOST_BYTES)]
     map_id: Annotated[int, Meta(ge=0, lt=1 << 32)] = 0
 
-    def said(self) -> str:
-        """For people."""
+    def label(self) -> str:
+        """Kind, name and version as text."""
         return f"{self.kind} {printable(self.name)} version {self.version}"
 
 
 def sha256_of(content: bytes) -> str:
-    """In hexadecimal digits."""
+    """SHA-256 in hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()
 
 
 def offer_of(kind: str, path: Path, version: int | None) -> tuple[Offer, bytes]:
-    """A file that is to be shared; without a version, the seconds at which the file was changed last.
+    """Offer and content of a file; the default version is its modification time (s).
 
     Raises:
-        Refused: it cannot be read, or is none that a robot could use.
+        Refused: unreadable, or not usable by a robot.
     """
     try:
         content = path.read_bytes()
@@ -92,7 +91,7 @@ def map_id_of(content: bytes, name: str) -> int:
     """Identity of the map in a file.
 
     Raises:
-        Refused: it is no map that could be used.
+        Refused: not a usable map.
     """
     try:
         return read(content).meta.map_id
@@ -101,10 +100,10 @@ def map_id_of(content: bytes, name: str) -> int:
 
 
 def survey_in(content: bytes, name: str, profile: Profile | None = None) -> Survey:
-    """The survey in a file; ``profile``: air interface that its lamps have to have, None: any.
+    """The survey in a file; ``profile``: required air interface profile of its lamps, None: any.
 
     Raises:
-        Refused: it is none that could be used.
+        Refused: not a usable survey.
     """
     try:
         with tempfile.TemporaryDirectory(prefix="lumiloop-fleet-") as folder:
@@ -118,15 +117,15 @@ def survey_in(content: bytes, name: str, profile: Profile | None = None) -> Surv
         raise Refused(f"{name}: cannot be checked, for want of a temporary file: {reason_of(error)}") from None
 
 
-class Taken(Held, frozen=True):
-    """What has been put to its place, ``path``; ``switched``: the daemon has gone on in it when asked."""
+class Installed(Held, frozen=True):
+    """An installed file at ``path``; ``switched``: the daemon was switched to it."""
 
     path: str = ""
     map_id: int = 0
     switched: bool = False
 
     def kept_in(self) -> Path | None:
-        """The survey's file, or the folder of maps, if it is still there; a daemon renames the map with every save."""
+        """The survey's file, or the folder of maps, if it still exists; a daemon renames the map with every save."""
         path = Path(self.path)
         if not self.path or not self.map_id:
             return path if self.path and path.exists() else None
@@ -137,54 +136,54 @@ class Taken(Held, frozen=True):
 
 
 class Records:
-    """What this robot has taken, in a file of the state directory; read anew where it has changed."""
+    """Records of the installed files, in a file of the state directory; read again after a change."""
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path or state_folder() / RECORD
-        self._read: tuple[int, dict[str, Taken]] = -1, {}
+        self._read: tuple[int, dict[str, Installed]] = -1, {}
 
-    def taken(self) -> dict[str, Taken]:
-        """By kind, as noted; empty where there is none, or the file cannot be read."""
+    def taken(self) -> dict[str, Installed]:
+        """Installed files by kind; empty where the record is missing or unreadable."""
         try:
             changed = self.path.stat().st_mtime_ns
         except OSError:
             return {}
         if changed != self._read[0]:
-            found: dict[str, Taken] = {}
+            found: dict[str, Installed] = {}
             with contextlib.suppress(OSError, msgspec.DecodeError, UnicodeDecodeError):
-                found = msgspec.json.decode(self.path.read_bytes(), type=dict[str, Taken])
+                found = msgspec.json.decode(self.path.read_bytes(), type=dict[str, Installed])
             self._read = changed, found
         return self._read[1]
 
     def held(self) -> dict[str, Held]:
-        """What of it is still in its place, for the fleet."""
+        """Installed files that still exist, for the fleet's state message."""
         return {
             kind: Held(one.version, one.sha256, one.name)
             for kind, one in self.taken().items()
             if one.kept_in() is not None
         }
 
-    def note(self, offer: Offer, where: Path) -> Taken:
-        """It has been put there; raises `OSError`."""
+    def note(self, offer: Offer, where: Path) -> Installed:
+        """Record an installation; raises `OSError`."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        one = Taken(offer.version, offer.sha256, offer.name, str(where.absolute()), offer.map_id)
+        one = Installed(offer.version, offer.sha256, offer.name, str(where.absolute()), offer.map_id)
         self._write(offer.kind, one)
         return one
 
-    def switched(self, one: Taken) -> None:
-        """The daemon goes on in that map; raises `OSError`."""
+    def switched(self, one: Installed) -> None:
+        """Record that the daemon was switched to that map; raises `OSError`."""
         self._write(MAP, msgspec.structs.replace(one, switched=True))
 
-    def _write(self, kind: str, one: Taken) -> None:
+    def _write(self, kind: str, one: Installed) -> None:
         taken = {**self.taken(), kind: one}
         write_whole(self.path, msgspec.json.format(msgspec.json.encode(taken), indent=2) + b"\n")
 
 
-def chosen(kind: str, offers: list[Offer], held: Held | None) -> Offer | None:
-    """The newest of what is offered; None: it is here already.
+def newest_offer(kind: str, offers: list[Offer], held: Held | None) -> Offer | None:
+    """The newest offer of a kind; None: it is installed already.
 
     Raises:
-        Refused: nothing is offered, or what is offered is older, or contradicts itself or what is here.
+        Refused: no offer, an older one, or different contents under one version.
     """
     fitting = [offer for offer in offers if offer.kind == kind]
     if not fitting:
@@ -200,47 +199,47 @@ def chosen(kind: str, offers: list[Offer], held: Held | None) -> Offer | None:
         )
     if held is not None and held.version > newest.version:
         raise Refused(
-            f"{newest.said()} is older than version {held.version}, which is here; to go back to it, share it with "
+            f"{newest.label()} is older than version {held.version}, which is here; to go back to it, share it with "
             f"--version {held.version + 1}"
         )
     return None if held is not None and held.version == newest.version else newest
 
 
 def check(offer: Offer, content: bytes) -> None:
-    """Whether what came is what was offered.
+    """Compare the received content with its offer.
 
     Raises:
-        Refused: it is not.
+        Refused: they differ.
     """
     if len(content) != offer.size or sha256_of(content) != offer.sha256:
         raise Refused(
-            f"{offer.said()}: what came ({len(content)} bytes) is not what was announced ({offer.size} bytes, SHA-256 "
+            f"{offer.label()}: what came ({len(content)} bytes) is not what was announced ({offer.size} bytes, SHA-256 "
             f"{offer.sha256[:12]}...); nothing is changed"
         )
 
 
-def place(offer: Offer, content: bytes, settings: Config, survey: Path | None) -> tuple[Path, str]:
-    """Check what came and put it to its place; where that is, and what else a person should know.
+def install(offer: Offer, content: bytes, settings: Config, survey: Path | None) -> tuple[Path, str]:
+    """Check and install a content; returns its path and a note for the user.
 
     Raises:
-        Refused: it cannot be used, or cannot be put there. Nothing is changed then.
+        Refused: not usable, or it cannot be written. Nothing is changed then.
     """
     check(offer, content)
     if offer.kind == MAP:
         map_id = map_id_of(content, offer.name)
         if map_id != offer.map_id:
-            raise Refused(f"{offer.said()}: holds map {map_id:08x}, not {offer.map_id:08x} as announced")
+            raise Refused(f"{offer.label()}: holds map {map_id:08x}, not {offer.map_id:08x} as announced")
         return place_map(content, map_id, settings)
-    where = home(SURVEY, settings, survey)
+    where = target_path(SURVEY, settings, survey)
     profile = PROFILES[settings.photodiode.profile]
     return place_survey(survey_in(content, offer.name, profile), where)
 
 
-def home(kind: str, settings: Config, survey: Path | None) -> Path:
-    """Where it goes: the survey's file, or the folder of maps; ``survey``: as the command line names it.
+def target_path(kind: str, settings: Config, survey: Path | None) -> Path:
+    """Target path: the survey's file, or the folder of maps; ``survey``: of the command line.
 
     Raises:
-        Refused: nobody has said so.
+        Refused: not configured.
     """
     if kind == MAP:
         if not settings.map.kept:
@@ -252,8 +251,8 @@ def home(kind: str, settings: Config, survey: Path | None) -> Path:
 
 
 def place_map(content: bytes, map_id: int, settings: Config) -> tuple[Path, str]:
-    """As the newest generation in the folder of maps, where the next start takes it."""
-    store = Store(home(MAP, settings, None), mend=False)
+    """Install a map as the newest generation in the folder of maps, for the next start."""
+    store = Store(target_path(MAP, settings, None), mend=False)
     try:
         return keep(settings, content, map_id), "the next start goes on in it"
     except BadMap as error:
@@ -261,14 +260,14 @@ def place_map(content: bytes, map_id: int, settings: Config) -> tuple[Path, str]
     except OSError as error:
         if not isinstance(error.__cause__, BlockingIOError):
             raise Refused(str(error)) from None
-    return _beside_daemon(store, content, map_id)
+    return _place_beside_daemon(store, content, map_id)
 
 
-def _beside_daemon(store: Store, content: bytes, map_id: int) -> tuple[Path, str]:
-    """A daemon keeps its maps there, in files that are named after the map: of another map they are nobody's but ours.
+def _place_beside_daemon(store: Store, content: bytes, map_id: int) -> tuple[Path, str]:
+    """Install a map into a running daemon's folder: file names contain the map's ID, so that another map is safe.
 
     Raises:
-        Refused: the daemon may be about to write that map itself.
+        Refused: the daemon itself keeps a map of that ID.
     """
     try:
         generations = store.generations()
@@ -285,19 +284,19 @@ def _beside_daemon(store: Store, content: bytes, map_id: int) -> tuple[Path, str
 
 
 def place_survey(shared: Survey, where: Path) -> tuple[Path, str]:
-    """The shared lamps with the receiver that this robot has; what was there before stays beside.
+    """Install the shared lamps with this robot's own receiver; the old file is kept under another name.
 
     Raises:
-        Refused: it cannot be written, or what is there cannot be read.
+        Refused: the file cannot be written, or the present one cannot be read.
     """
     words = "its receiver is the shared file's: look at [receiver]"
     try:
         if where.exists():
             own, old = read_survey(where), where.read_bytes()
             shared = replace(shared, receiver=own.receiver)
-            aside = _aside(where, old)
-            words = f"[receiver] is this robot's own as before; the old file is {aside.name}"
-            write_whole(aside, old)
+            backup = _backup_path(where, old)
+            words = f"[receiver] is this robot's own as before; the old file is {backup.name}"
+            write_whole(backup, old)
         write_whole(where, dump(shared, ("Lamps as shared in the fleet.",)).encode())
     except SurveyError as error:
         raise Refused(f"{error}; mend it, or move it away") from None
@@ -306,8 +305,8 @@ def place_survey(shared: Survey, where: Path) -> tuple[Path, str]:
     return where, f"the daemon takes it at its next start; {words}"
 
 
-def _aside(where: Path, old: bytes) -> Path:
-    """Where the old file goes: over none that holds anything else, for one of these is the robot's own."""
+def _backup_path(where: Path, old: bytes) -> Path:
+    """Path for the old file: the first unused one, or one with the same content."""
     names = (
         where.with_name(f"{where.name}{BEFORE}{number}")
         for number in itertools.chain(("",), map(str, itertools.count(2)))

@@ -1,7 +1,7 @@
-"""`lumiloop fleet join`: a running daemon tells its fleet where it is and how, under ``lumiloop/<robot>/``.
+"""`lumiloop fleet join`: publishes pose, state, loops and map of the running daemon under ``lumiloop/<robot>/``.
 
-What was told last of everything is kept and given to who asks (`session.get("lumiloop/*/state")`), so that who comes
-late need not wait for a change.
+The last message of each topic answers queries (`session.get("lumiloop/*/state")`), so that a late subscriber need not
+wait for a change.
 """
 
 from __future__ import annotations
@@ -17,60 +17,60 @@ from typing import Final
 import msgspec
 import zenoh
 
-from daemon.cli import parser
 from daemon.config.paths import maps_folder
 from daemon.maps.container import BadMap
 from daemon.maps.schema import read
 from daemon.maps.store import Store
-from hal.run_server import work_until_told
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
+from daemon.system import console
+from hal.run_server import run_until_stopped
 from taps.fleet import messages
 from taps.fleet.claim import Claim
-from taps.fleet.messages import MapHead, PoseTold, StateTold
+from taps.fleet.messages import MapHead, PoseMessage, StateMessage
 from taps.fleet.placing import Records
 from taps.metrics.vda5050 import position_v2
-from taps.stream.client import Lost, Stream
-from taps.stream.messages import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
-from taps.stream.tiles import Tiles, trinary
-from taps.zenoh_session import BadEndpoint, joined, watched, withdraw
+from taps.stream.tiles import TileMap, trinary
+from taps.zenoh_session import BadEndpoint, open_session, undeclare, watch_router
 
 WANTED: Final = ("pose", "loop", "faults", "map")
 STATE_S: Final = 5.0
-"""The state is told at a change, and so often."""
+"""Period of the state message, besides one at each change."""
 MAP_S: Final = 10.0
-"""The map is told at most so often, and only when it has changed."""
+"""Least interval of map messages; only a changed map is sent."""
 NAME_S: Final = 10.0
-"""How often a map's name is looked for that has none yet."""
+"""Interval of searches for the name of a map without one."""
 OLD_S: Final = 3.0
-"""A daemon that has told no pose for so long stands, and does not know where the robot is."""
+"""A daemon without a pose for this long counts as hanging, and its pose as invalid."""
 
 
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     stream = Stream(args.stream or args.settings.name, WANTED)
     try:
-        asyncio.run(work_until_told(tell(args, stream)))
+        asyncio.run(run_until_stopped(join(args, stream)))
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except NotTheStream as error:
-        return parser.fail(str(error))
-    return parser.OK
+        return console.fail(str(error))
+    return console.OK
 
 
-async def tell(args: argparse.Namespace, stream: Stream) -> None:
-    """Join the fleet and tell it all, until cancelled.
+async def join(args: argparse.Namespace, stream: Stream) -> None:
+    """Join the fleet and publish until cancelled.
 
     Raises:
-        BadEndpoint: no such router can be. NotTheStream: there is no such daemon.
+        BadEndpoint: invalid endpoint. NotTheStream: the other end is no daemon of this version.
     """
     name = args.settings.name
-    async with joined(args.router, args.zenoh) as session:
-        voice = Voice(session, name)
-        robot = Robot(voice, Records(), args.settings.map.folder)
-        claim = Claim(session, name, socket.gethostname(), voice.give)
+    async with open_session(args.router, args.zenoh) as session:
+        publisher = Publisher(session, name)
+        robot = Robot(publisher, Records(), args.settings.map.folder)
+        claim = Claim(session, name, socket.gethostname(), publisher.set_active)
         works = [
             asyncio.create_task(work)
             for work in (
-                watched(session, args.router, lambda there: None),
+                watch_router(session, args.router, lambda there: None),
                 claim.run(),
                 beat(robot, args.rate),
                 follow(stream, robot),
@@ -82,36 +82,36 @@ async def tell(args: argparse.Namespace, stream: Stream) -> None:
             for work in works:
                 work.cancel()
             await asyncio.gather(*works, return_exceptions=True)
-            voice.give(False)
+            publisher.set_active(False)
 
 
-class Voice:
-    """Tells, while the name is ours, and answers who asks what was told last."""
+class Publisher:
+    """Publishes while the name is held, and answers queries with the last messages."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
         self._session, self._robot = session, robot
         self._latest: dict[str, tuple[bytes, bytes | None]] = {}
-        self._answering: zenoh.Queryable[None] | None = None
+        self._queryable: zenoh.Queryable[None] | None = None
 
-    def give(self, word: bool) -> None:
-        """We have the word, or not."""
-        if word and self._answering is None:
-            self._answering = self._session.declare_queryable(messages.key(self._robot, "*"), self._answer)
+    def set_active(self, active: bool) -> None:
+        """Start or stop publishing, with the claim of the name."""
+        if active and self._queryable is None:
+            self._queryable = self._session.declare_queryable(messages.key(self._robot, "*"), self._answer)
             for key, (content, attachment) in list(self._latest.items()):
                 self._session.put(key, content, attachment=attachment)
-        elif not word and self._answering is not None:
-            withdraw(self._answering)
-            self._answering = None
+        elif not active and self._queryable is not None:
+            undeclare(self._queryable)
+            self._queryable = None
 
-    def say(self, topic: str, content: bytes, attachment: bytes | None = None) -> None:
-        """Tell one message; while the word is another's it is kept only."""
+    def publish(self, topic: str, content: bytes, attachment: bytes | None = None) -> None:
+        """Publish one message; while inactive it is only kept."""
         key = messages.key(self._robot, topic)
         self._latest[key] = content, attachment
-        if self._answering is not None:
+        if self._queryable is not None:
             self._session.put(key, content, attachment=attachment, congestion_control=zenoh.CongestionControl.DROP)
 
     def _answer(self, query: zenoh.Query) -> None:
-        """Called by the session's thread."""
+        """Answer a query; called by the session's thread."""
         with query:
             for key, (content, attachment) in list(self._latest.items()):
                 if query.key_expr.intersects(key):
@@ -119,85 +119,89 @@ class Voice:
 
 
 class Robot:
-    """Makes messages of what the daemon tells.
+    """Converts stream messages to fleet messages.
 
     Args:
-        voice: tells them. records: of what is held of the fleet's. folder: of maps, as configured.
+        publisher: sends them. records: of installed shared files. folder: of maps, as configured.
     """
 
-    def __init__(self, voice: Voice, records: Records, folder: str) -> None:
-        self._voice, self._records, self._folder = voice, records, folder
+    def __init__(self, publisher: Publisher, records: Records, folder: str) -> None:
+        self._publisher, self._records, self._folder = publisher, records, folder
         self._pose: Pose | None = None
         self._held: Pose | None = None
         self._faults: Faults | None = None
-        self._tiles = Tiles()
-        self._heard = self._stated = self._drawn = -math.inf
+        self._tiles = TileMap()
+        self._t_pose = self._stated = self._drawn = -math.inf
         self._seq = -1
         self._lost = False
-        self._said: StateTold | None = None
+        self._last_state: StateMessage | None = None
         self._name: tuple[int, str] = 0, ""
         self._looked = 0.0
 
-    def take(self, frame: Frame | Lost) -> None:
-        """Take one in; loops are told at once."""
+    def receive(self, frame: Frame | Lost) -> None:
+        """Process one stream message; loop closures are published at once."""
         match frame:
             case Lost():
                 self._pose = self._faults = None
             case Hello():
-                self._tiles, self._held = Tiles(), None
+                self._tiles, self._held = TileMap(), None
             case Pose():
-                self._pose, self._heard = frame, time.monotonic()
+                self._pose, self._t_pose = frame, time.monotonic()
                 self._held = frame if frame.pose is not None else self._held
             case Faults():
                 self._faults = frame
             case Loop() if self._pose is not None:
-                self._voice.say("loops", messages.encode(messages.loop_told(frame, self._pose.utc(frame.t_mono))))
+                self._publisher.publish(
+                    "loops", messages.encode(messages.loop_message(frame, self._pose.utc(frame.t_mono)))
+                )
             case MapTiles():
-                self._tiles.take(frame)
+                self._tiles.update(frame)
 
     def beat(self) -> None:
-        """Tell what is due."""
+        """Publish what is due."""
         now = time.monotonic()
-        stands = now - self._heard > OLD_S
-        if (pose := self._pose) is not None and not stands:
+        hangs = now - self._t_pose > OLD_S
+        if (pose := self._pose) is not None and not hangs:
             if pose.seq != self._seq:
                 self._seq, self._lost = pose.seq, False
-                self._tell(pose)
+                self._publish_pose(pose)
         elif (held := self._held) is not None and not self._lost:
-            # what was told last is given to who comes late: it must not say that the robot knows its place
+            # late subscribers receive the last message: it must not claim a valid pose
             self._seq, self._lost = -1, True
-            self._tell(msgspec.structs.replace(held, pose=None, covariance=None, velocity=None))
-        state = self._state(stands)
+            self._publish_pose(msgspec.structs.replace(held, pose=None, covariance=None, velocity=None))
+        state = self._state(hangs)
         since = now - self._stated
         if (
             since >= STATE_S
-            or self._said is None
-            or msgspec.structs.replace(state, t_utc=self._said.t_utc) != self._said
+            or self._last_state is None
+            or msgspec.structs.replace(state, t_utc=self._last_state.t_utc) != self._last_state
         ):
-            self._said, self._stated = state, now
-            self._voice.say("state", messages.encode(state))
-        if self._tiles.fresh and now - self._drawn >= MAP_S:
+            self._last_state, self._stated = state, now
+            self._publisher.publish("state", messages.encode(state))
+        if self._tiles.changed and now - self._drawn >= MAP_S:
             self._drawn = now
             self._draw()
 
-    def _tell(self, pose: Pose) -> None:
-        told = PoseTold(
+    def _publish_pose(self, pose: Pose) -> None:
+        told = PoseMessage(
             seq=pose.seq,
             t_utc=pose.utc(pose.t_mono),
             agvPosition=position_v2(pose, self._held, self._map_name(pose.map_id)),
             velocity=pose.velocity,
             covariance=pose.covariance,
         )
-        self._voice.say("pose", messages.encode(told))
+        self._publisher.publish("pose", messages.encode(told))
 
-    def _state(self, stands: bool) -> StateTold:
-        if self._pose is None or stands:
+    def _state(self, hangs: bool) -> StateMessage:
+        if self._pose is None or hangs:
             meaning = "the daemon does not answer" if self._pose is None else "the daemon stands"
-            return StateTold(t_utc=time.time(), up=False, state_name="DOWN", meaning=meaning, held=self._records.held())
-        return messages.state_told(self._pose, self._faults, self._records.held(), self._map_name(self._pose.map_id))
+            return StateMessage(
+                t_utc=time.time(), up=False, state_name="DOWN", meaning=meaning, held=self._records.held()
+            )
+        return messages.state_message(self._pose, self._faults, self._records.held(), self._map_name(self._pose.map_id))
 
     def _map_name(self, map_id: int) -> str:
-        """What its file calls the map; one that has no name yet, or no file, is looked for again."""
+        """Name of the map in its file; a missing one is searched for again."""
         now = time.monotonic()
         if self._name[0] != map_id or (not self._name[1] and now - self._looked >= NAME_S):
             self._name, self._looked = (map_id, name_of(self._folder, map_id)), now
@@ -214,11 +218,11 @@ class Robot:
             rows=cells.shape[0],
             origin=corner,
         )
-        self._voice.say("map", *messages.map_told(head, cells))
+        self._publisher.publish("map", *messages.map_message(head, cells))
 
 
 def name_of(folder: str, map_id: int) -> str:
-    """What the stored map of that identity is called; empty where that is not known."""
+    """Name of the stored map with that ID; empty where unknown."""
     with contextlib.suppress(OSError):
         for one in Store(maps_folder(folder), mend=False).generations():
             if one.map_id == map_id:
@@ -228,14 +232,14 @@ def name_of(folder: str, map_id: int) -> str:
 
 
 async def beat(robot: Robot, rate: float) -> None:
-    """Tell what is due, so many times a second, until cancelled."""
+    """Publish what is due, ``rate`` times per second, until cancelled."""
     while True:
         robot.beat()
         await asyncio.sleep(1.0 / rate)
 
 
 async def follow(stream: Stream, robot: Robot) -> None:
-    """Listen to the daemon until cancelled.
+    """Read the stream until cancelled.
 
     Raises:
         NotTheStream: the other end is no daemon of this version.
@@ -243,5 +247,5 @@ async def follow(stream: Stream, robot: Robot) -> None:
     async with contextlib.aclosing(stream.frames()) as frames:
         async for frame in frames:
             if isinstance(frame, Lost):
-                parser.say(f"{frame.text}; waiting")
-            robot.take(frame)
+                console.say(f"{frame.text}; waiting")
+            robot.receive(frame)

@@ -1,7 +1,7 @@
-"""Who is in the fleet and how: what robots have told, in order. Pure: messages in, rows out.
+"""The robots of a fleet and their latest messages. Pure: messages in, members out.
 
-Whoever reaches the router may make up names, maps and words: of each there is room for so much, and who is there keeps
-the place that it has.
+Any client of the router can invent names, maps and texts: the memory for each is bounded, and present members are never
+displaced.
 """
 
 from __future__ import annotations
@@ -11,34 +11,34 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from taps.fleet import messages
-from taps.fleet.messages import Cells, LoopTold, MapHead, PoseTold, StateTold, Unreadable, printable
+from taps.fleet.messages import Cells, LoopMessage, MapHead, PoseMessage, StateMessage, Unreadable, printable
 from taps.stream.tiles import UNSEEN
 
 FARTHEST: Final = 1e6
-"""No number that is shown is larger, in m or rad."""
+"""Largest displayed number, m or rad."""
 GONE_S: Final = 3600.0
-"""Who has not been there, nor been heard, for so long leaves."""
+"""A robot that is absent and silent for this long is removed."""
 MOST_ROBOTS: Final = 256
 MOST_INSTANCES: Final = 16
-"""So many speak for one name, and wait for it; there should be one."""
+"""Most publishers, and waiting claimants, per name; there should be one."""
 MOST_MAPS: Final = 128 << 20
-"""Bytes of all robots' maps together, as they were told: deflated."""
+"""Most bytes of all robots' maps together, deflated."""
 
 
 Chart = tuple[MapHead, Cells]
 """A map, and its cells (rows, columns) from below."""
 
 
-def number(told: object) -> float | None:
-    """A finite number; None where it is none."""
-    if isinstance(told, bool) or not isinstance(told, (int, float)) or not abs(told) < FARTHEST:
+def number(value: object) -> float | None:
+    """The value as a finite number in range; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < FARTHEST:
         return None
-    return float(told)
+    return float(value)
 
 
 @dataclass(frozen=True, slots=True)
 class MapKept:
-    """A map as it was told, which can be read; ``seen``: cells of it that are known."""
+    """A valid map as received; ``seen``: number of known cells."""
 
     head: MapHead
     content: bytes
@@ -51,36 +51,36 @@ class Member:
     """One robot.
 
     Attributes:
-        speakers, waiting: instances that speak for it, or wait for the name (`messages.instance_of`).
-        t_heard: when it told its pose or state last, by our own clock. t_there: when it was there last, as far as that
-            has been looked at. loops: so far, as far as heard.
-        problem: the latest message of it that could not be read.
+        publishers, waiting: claimants that publish, or wait for the name (`messages.instance_of`).
+        t_message: arrival of its last pose or state, on this computer's clock. t_present: when its presence was last
+            checked and found. loop: the latest.
+        problem: of its latest invalid message.
     """
 
     name: str
-    speakers: set[str] = field(default_factory=set)
+    publishers: set[str] = field(default_factory=set)
     waiting: set[str] = field(default_factory=set)
-    pose: PoseTold | None = None
-    state: StateTold | None = None
-    loop: LoopTold | None = None
+    pose: PoseMessage | None = None
+    state: StateMessage | None = None
+    loop: LoopMessage | None = None
     map: MapKept | None = None
-    t_heard: float = -math.inf
-    t_there: float = -math.inf
+    t_message: float = -math.inf
+    t_present: float = -math.inf
     problem: str = ""
 
     @property
     def there(self) -> bool:
-        """Whether anybody speaks for it, or would."""
-        return bool(self.speakers or self.waiting)
+        """Whether any claimant of its name is present."""
+        return bool(self.publishers or self.waiting)
 
     @property
     def t_last(self) -> float:
-        """When there was a sign of it last."""
-        return max(self.t_heard, self.t_there)
+        """Time of the last sign of it."""
+        return max(self.t_message, self.t_present)
 
     @property
     def place(self) -> tuple[float, float, float] | None:
-        """Where it is: x, y (m), theta (rad); where it was last, if it is lost."""
+        """Its pose x, y (m), theta (rad); the last one if it is lost."""
         at = self.pose.agvPosition if self.pose is not None else None
         if at is None:
             return None
@@ -89,28 +89,28 @@ class Member:
 
     @property
     def map_id(self) -> str:
-        """The map in which its place is meant."""
+        """The map of its pose."""
         at = self.pose.agvPosition if self.pose is not None else None
         return "" if at is None else str(at.get("mapId", ""))
 
     @property
     def localised(self) -> bool:
-        """Whether it knows its place, and tells it."""
+        """Whether it publishes a valid pose."""
         at = self.pose.agvPosition if self.pose is not None else None
         up = self.state is None or self.state.up
-        return bool(self.speakers) and up and at is not None and at.get("positionInitialized") is True
+        return bool(self.publishers) and up and at is not None and at.get("positionInitialized") is True
 
 
 class Roster:
-    """All robots that have been heard of, but for those that have been gone for long."""
+    """All robots seen recently."""
 
     def __init__(self) -> None:
         self.members: dict[str, Member] = {}
         self._full = False
         self._drawn: tuple[MapKept, Chart] | None = None
 
-    def take(self, key: str, content: bytes, attachment: bytes, now: float) -> None:
-        """A message; one that cannot be read is kept as a problem of its robot."""
+    def receive(self, key: str, content: bytes, attachment: bytes, now: float) -> None:
+        """Store a message; an invalid one is stored as a problem of its robot."""
         words = key.split("/")
         if len(words) != 3 or words[0] != messages.ROOT or words[2] not in messages.TOPICS:
             return
@@ -119,11 +119,11 @@ class Roster:
         try:
             match words[2]:
                 case "pose":
-                    member.pose, member.t_heard = messages.read(content, PoseTold), now
+                    member.pose, member.t_message = messages.read(content, PoseMessage), now
                 case "state":
-                    member.state, member.t_heard = messages.read(content, StateTold), now
+                    member.state, member.t_message = messages.read(content, StateMessage), now
                 case "loops":
-                    member.loop = messages.read(content, LoopTold)
+                    member.loop = messages.read(content, LoopMessage)
                 case "map":
                     self._keep_map(member, content, attachment)
             member.problem = ""
@@ -131,47 +131,47 @@ class Roster:
             member.problem = f"{words[2]}: {error}"
 
     def token(self, key: str, there: bool) -> str:
-        """A liveliness token comes or goes; the robot's name where somebody begins to speak for it, else empty."""
+        """Process a liveliness token that appears or vanishes; returns the robot of a new publisher, else ""."""
         words = key.split("/")
         if len(words) != 4 or words[0] != messages.ROOT or words[2] not in ("alive", "waiting"):
             return ""
         member = self._member(words[1]) if there else self.members.get(words[1])
         if member is None:
             return ""
-        instances = member.speakers if words[2] == "alive" else member.waiting
+        instances = member.publishers if words[2] == "alive" else member.waiting
         if not there:
             instances.discard(words[3])
         elif len(instances) < MOST_INSTANCES:
             instances.add(words[3])
         return member.name if there and words[2] == "alive" else ""
 
-    def forget(self, now: float, router: bool) -> None:
-        """Who has been gone for long leaves; without a router nobody is known to have gone.
+    def drop_absent(self, now: float, router: bool) -> None:
+        """Remove long absent robots; without a router none counts as absent.
 
-        To be called now and then, after what is known was shown: that there was no room is told once.
+        Call it after each display: the note about a full roster appears once.
         """
         for member in list(self.members.values()):
             if member.there or not router:
-                member.t_there = now
+                member.t_present = now
             elif now - member.t_last > GONE_S:
                 del self.members[member.name]
         self._full = False
 
     def without_router(self) -> None:
-        """Nobody can be seen any more."""
+        """The router is lost: no presence is known."""
         for member in self.members.values():
-            member.speakers.clear()
+            member.publishers.clear()
             member.waiting.clear()
 
     def sorted(self) -> list[Member]:
-        """By name."""
+        """Members in order of their names."""
         return [self.members[name] for name in sorted(self.members)]
 
     def problems(self) -> list[str]:
-        """What a person should know, a line each."""
+        """Problems for the user, one line each."""
         found = []
         for member in self.sorted():
-            hosts = [messages.host_of(one) for one in sorted(member.speakers | member.waiting)]
+            hosts = [messages.host_of(one) for one in sorted(member.publishers | member.waiting)]
             if len(hosts) > 1:
                 found.append(
                     f"{member.name}: {len(hosts)} robots have this name, on {', '.join(hosts)}; the first one is "
@@ -193,7 +193,7 @@ class Roster:
         return [printable(line) for line in found]
 
     def chart(self) -> Chart | None:
-        """The map that most robots are in, as the robot tells it that has seen most of it."""
+        """The map with most robots, from the robot that knows most of it."""
         count: dict[str, int] = {}
         for member in self.members.values():
             count[member.map_id] = count.get(member.map_id, 0) + 1
@@ -206,10 +206,10 @@ class Roster:
         return None if self._drawn is None else self._drawn[1]
 
     def _keep_map(self, member: Member, content: bytes, attachment: bytes) -> None:
-        """In the place of its older one.
+        """Replace a member's map.
 
         Raises:
-            Unreadable: it is none, or there is no room for it.
+            Unreadable: invalid, or too large.
         """
         others = sum(len(one.map.content) for one in self.members.values() if one.map is not None and one is not member)
         if others + len(content) > MOST_MAPS:
@@ -218,7 +218,7 @@ class Roster:
         member.map = MapKept(head, content, attachment, int((cells != UNSEEN).sum()))
 
     def _member(self, name: str) -> Member | None:
-        """The robot of that name, a new one if need be: in the place of who has been gone longest, if all are taken."""
+        """The robot of that name, added if necessary; in a full roster it replaces the longest absent one."""
         if (member := self.members.get(name)) is not None or len(name) > messages.LONGEST_NAME:
             return member
         if len(self.members) >= MOST_ROBOTS:

@@ -1,4 +1,4 @@
-"""`lumiloop fleet share` and `lumiloop fleet router`: a survey and a map for all robots; and what they meet at."""
+"""`lumiloop fleet share`: offers a survey and a map to all robots. `lumiloop fleet router`: runs a Zenoh router."""
 
 from __future__ import annotations
 
@@ -8,71 +8,73 @@ import socket
 
 import zenoh
 
-from daemon.cli import parser
-from hal.run_server import until_told, work_until_told
+from daemon.system import console
+from hal.run_server import run_until_stopped, until_stopped
 from taps.fleet import messages
 from taps.fleet.messages import SHARED, encode
 from taps.fleet.placing import MAP, SURVEY, Offer, Refused, offer_of
-from taps.zenoh_session import BadEndpoint, config, joined, watched, withdraw, words
+from taps.zenoh_session import BadEndpoint, error_text, open_session, session_config, undeclare, watch_router
 
 
 def main(args: argparse.Namespace) -> int:
     """Share until stopped; returns the exit code."""
-    asked = [(kind, path) for kind, path in ((SURVEY, args.survey), (MAP, args.map)) if path is not None]
-    if not asked:
-        return parser.fail("say what to share: --survey FILE, --map FILE", parser.USAGE)
+    requested = [(kind, path) for kind, path in ((SURVEY, args.survey), (MAP, args.map)) if path is not None]
+    if not requested:
+        return console.fail("say what to share: --survey FILE, --map FILE", console.USAGE)
     try:
-        offers = [offer_of(kind, path, args.version) for kind, path in asked]
-        asyncio.run(work_until_told(share(args, offers)))
+        offers = [offer_of(kind, path, args.version) for kind, path in requested]
+        asyncio.run(run_until_stopped(share(args, offers)))
     except Refused as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
-    return parser.OK
+        return console.fail(str(error), console.USAGE)
+    return console.OK
 
 
 async def share(args: argparse.Namespace, offers: list[tuple[Offer, bytes]]) -> None:
-    """Offer these until cancelled.
+    """Serve the offers until cancelled.
 
     Raises:
-        BadEndpoint: no such router can be.
+        BadEndpoint: invalid endpoint.
     """
-    told: dict[str, bytes] = {}
+    contents: dict[str, bytes] = {}
     for offer, content in offers:
-        told[key_of(offer.kind)] = encode(offer)
-        told[key_of(offer.kind, offer.sha256)] = content
+        contents[key_of(offer.kind)] = encode(offer)
+        contents[key_of(offer.kind, offer.sha256)] = content
 
     def answer(query: zenoh.Query) -> None:
         with query:
-            for key, content in told.items():
+            for key, content in contents.items():
                 if query.key_expr.intersects(key):
                     query.reply(key, content)
 
-    async with joined(args.router, args.zenoh) as session:
+    async with open_session(args.router, args.zenoh) as session:
         session.declare_queryable(f"{SHARED}/**", answer)
         instance = messages.instance_of(str(session.info.zid()), socket.gethostname(), messages.now_ms())
-        token = session.liveliness().declare_token(f"{SHARED}/alive/{instance}")  # robots ask when they see it
+        token = session.liveliness().declare_token(f"{SHARED}/alive/{instance}")  # robots query when it appears
         try:
             for offer, _ in offers:
-                parser.say(f"{offer.said()}, {offer.size} bytes, SHA-256 {offer.sha256}")
-            await watched(session, args.router, lambda there: None)
+                console.say(f"{offer.label()}, {offer.size} bytes, SHA-256 {offer.sha256}")
+            await watch_router(session, args.router, lambda there: None)
         finally:
-            withdraw(token)  # one to which no name leads any more is withdrawn by the library, unasked
+            undeclare(token)  # keeps a reference: the library undeclares unreferenced tokens
 
 
 def key_of(kind: str, sha256: str = "") -> str:
-    """Where an offer is told, or its content."""
+    """Zenoh key of an offer, or of its content."""
     return f"{SHARED}/{kind}/{sha256}" if sha256 else f"{SHARED}/{kind}"
 
 
 def router(args: argparse.Namespace) -> int:
-    """Be a router until stopped; returns the exit code."""
+    """Run a router until stopped; returns the exit code."""
     try:
-        with zenoh.open(config("router", args.listen, args.zenoh)):
-            parser.say(f"router at {args.listen}")
-            asyncio.run(until_told())
+        with zenoh.open(session_config("router", args.listen, args.zenoh)):
+            console.say(f"router at {args.listen}")
+            asyncio.run(until_stopped())
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except zenoh.ZError as error:
-        return parser.fail(f"cannot listen on {args.listen}: {words(error)}; free it, or name another with --listen")
-    return parser.OK
+        return console.fail(
+            f"cannot listen on {args.listen}: {error_text(error)}; free it, or name another with --listen"
+        )
+    return console.OK

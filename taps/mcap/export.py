@@ -1,7 +1,7 @@
-"""`lumiloop export RECORDING --mcap OUT.mcap`: a recording, or a dump of a flight recorder, in other formats.
+"""`lumiloop export RECORDING --mcap OUT.mcap`: converts a recording, or a flight recorder's dump, to other formats.
 
-The recording is replayed, so that what is written is what the daemon said then, covariances and all. What stops it
-early is said, and what was read until then is kept.
+The recording is replayed: the output is what the daemon published then, with covariances. If the replay ends early, the
+cause is printed and the output up to there is kept.
 """
 
 from __future__ import annotations
@@ -16,49 +16,49 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from daemon.cli import parser
-from daemon.cli.replay import Given
+from daemon.replay.recorded_inputs import Given
 from daemon.replay.results import OutputRefused, kitti, tum
 from daemon.runtime import warmup
+from daemon.system import console
 from daemon.system.atomic_file import write_whole
 from daemon.system.extras import how_to_install
 from daemon.system.versions import made_elsewhere
 from hal.errors import HalError
-from taps.stream.recording_source import Retold
+from taps.stream.recording_source import RecordingSource
 
-if TYPE_CHECKING:  # needs an extra, which who wants a trajectory alone does not
+if TYPE_CHECKING:  # an extra that a trajectory alone does not need
     from taps.mcap.writer import McapFile
     from taps.ros.messages import Translator
 
 GROWTH: Final = 1.25
-"""The map is written when it has so many times the keyframes of the one before: a long drive has few pictures of it."""
+"""The map is written again once its keyframes have grown by this factor, so that a long drive has few maps."""
 FIRST_MAP: Final = 5
 IN_A_LOG_S: Final = 10.0
-"""So often progress is told where it is no line that writes over itself."""
+"""Period of progress lines where standard error is no terminal."""
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 
 
-class WouldLose(Exception):
-    """What is asked for would write over what is read, or over itself, or could not be written when it is made."""
+class OutputConflict(Exception):
+    """An output that would overwrite the input or another output, or that cannot be written."""
 
 
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.mcap is None and args.tum is None and args.kitti is None:
-        return parser.fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", parser.USAGE)
+        return console.fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", console.USAGE)
     try:
         with _stoppable():
             return _save(args) if _is_mcap(args.log) else _export(args)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("daemon", "estimator", "hal", "taps"):
             raise
-        return parser.fail(f"MCAP files need {error.name}, which is not installed: {how_to_install('mcap')}")
-    except WouldLose as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(f"MCAP files need {error.name}, which is not installed: {how_to_install('mcap')}")
+    except OutputConflict as error:
+        return console.fail(str(error), console.USAGE)
     except (HalError, OutputRefused, warmup.CannotLoad) as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except OSError as error:
-        return parser.fail(f"{error.filename or args.log}: {error.strerror}; free space or name another file")
+        return console.fail(f"{error.filename or args.log}: {error.strerror}; free space or name another file")
 
 
 def _is_mcap(path: Path) -> bool:
@@ -69,62 +69,62 @@ def _is_mcap(path: Path) -> bool:
 
 
 def _save(args: argparse.Namespace) -> int:
-    """An MCAP file is the source: what is whole in it is copied."""
+    """Recover an MCAP file: copy its intact messages."""
     from taps.mcap.recover import NotMcap, recover
 
     if args.tum or args.kitti:
-        told = f"{args.log} is an MCAP file: only --mcap can be made of it, with all that is whole"
-        return parser.fail(f"{told}; trajectories are made of the recording itself", parser.USAGE)
-    _refuse_to_write_over((args.log,), args)
+        problem = f"{args.log} is an MCAP file: only --mcap can be made of it, with all that is whole"
+        return console.fail(f"{problem}; trajectories are made of the recording itself", console.USAGE)
+    _check_outputs((args.log,), args)
     try:
         found = recover(args.log, args.mcap)
     except NotMcap as error:
-        return parser.fail(str(error))
-    parser.say(f"{args.mcap}: {found.sentence()}")
-    return parser.OK
+        return console.fail(str(error))
+    console.say(f"{args.mcap}: {found.sentence()}")
+    return console.OK
 
 
 def _export(args: argparse.Namespace) -> int:
     keys = tuple(override.partition("=")[0].strip() for override in args.set)
-    told = Retold(args.log, args.settings, Given(args.config is not None, keys))
-    _refuse_to_write_over(told.source.files, args)
-    if made := made_elsewhere(told.source.header):
-        parser.say(f"{args.log}: {made}")
+    source = RecordingSource(args.log, args.settings, Given(args.config is not None, keys))
+    _check_outputs(source.source.files, args)
+    if made := made_elsewhere(source.source.header):
+        console.say(f"{args.log}: {made}")
     stopped = ""
     if args.mcap is None:
-        stopped = _run(told, None, None)
+        stopped = _run(source, None, None)
     else:
         from taps.mcap.writer import McapFile
         from taps.ros.messages import Translator
 
-        with _beside(args.mcap) as path, McapFile(path, flush_s=0.0) as file:
-            translator = Translator(told.config.lidar.mount, told.source.utc)
-            stopped = _run(told, translator, file)
-            _draw(told, translator, file)
-        parser.say(f"{args.mcap}: {file.messages} messages")
-    final = told.rerun.ledger.online() if args.online else told.rerun.ledger.final()
+        with _replaced_on_success(args.mcap) as path, McapFile(path, flush_s=0.0) as file:
+            translator = Translator(source.config.lidar.mount, source.source.utc)
+            stopped = _run(source, translator, file)
+            _draw(source, translator, file)
+        console.say(f"{args.mcap}: {file.messages} messages")
+    final = source.rerun.ledger.online() if args.online else source.rerun.ledger.final()
     guesses = sum(map(bool, final.guesses()))
     guessed = f", and {guesses} guesses that are none" if guesses else ""
     for path, text in ((args.tum, tum), (args.kitti, kitti)):
         if path is not None:
             write_whole(path, text(final))
             none = "" if len(final.stamps) else "; no cycle in the recording had a pose"
-            parser.say(f"{path}: {len(final.stamps) - guesses} poses{guessed}{none}")
-    for sentence in told.source.report.sentences():
-        parser.say(f"{args.log}: {sentence}")
-    if told.rerun.comparison.differ:
-        count, first = told.rerun.comparison.differ, told.rerun.comparison.first
-        parser.say(
+            console.say(f"{path}: {len(final.stamps) - guesses} poses{guessed}{none}")
+    for sentence in source.source.report.sentences():
+        console.say(f"{args.log}: {sentence}")
+    if source.rerun.comparison.differ:
+        count, first = source.rerun.comparison.differ, source.rerun.comparison.first
+        console.say(
             f"the replay is not the recorded run in {count} cycles: other software, or records lost; first {first}"
         )
-    return parser.fail(f"{stopped}; what was read until then is written") if stopped else parser.OK
+    return console.fail(f"{stopped}; what was read until then is written") if stopped else console.OK
 
 
-def _refuse_to_write_over(read: Iterable[Path], args: argparse.Namespace) -> None:
-    """Before anything is replayed: what is read from, is named twice, is there already, or has no folder.
+def _check_outputs(read: Iterable[Path], args: argparse.Namespace) -> None:
+    """Check the outputs before the replay: none may be the input, a second output, or an existing MCAP file.
 
     Raises:
-        WouldLose: naming the option.
+        OutputConflict: naming the option.
     """
     taken = {path.resolve(): "the file that is read" for path in read}
     for option in ("mcap", "tum", "kitti"):
@@ -132,22 +132,24 @@ def _refuse_to_write_over(read: Iterable[Path], args: argparse.Namespace) -> Non
         if target is None:
             continue
         if target.resolve() in taken:
-            raise WouldLose(f"--{option} {target}: is {taken[target.resolve()]}; name another one")
+            raise OutputConflict(f"--{option} {target}: is {taken[target.resolve()]}; name another one")
         if not target.parent.is_dir():
-            raise WouldLose(f"--{option} {target}: there is no folder {target.parent}; make it, or name another file")
-        if option == "mcap" and target.exists() and not args.force:  # it may have been recorded live, once and for all
-            raise WouldLose(f"--mcap {target} is there already; name another file, or replace it with --force")
+            raise OutputConflict(
+                f"--{option} {target}: there is no folder {target.parent}; make it, or name another file"
+            )
+        if option == "mcap" and target.exists() and not args.force:  # it may be the only copy of a live recording
+            raise OutputConflict(f"--mcap {target} is there already; name another file, or replace it with --force")
         taken[target.resolve()] = f"what --{option} writes, too"
 
 
 @contextmanager
 def _stoppable() -> Iterator[None]:
-    """SIGTERM ends it as Ctrl-C does: nothing half made stays behind."""
+    """Let SIGTERM end the command as Ctrl-C does, so that no partial file stays."""
 
     def stop(number: int, _: object) -> None:
         sys.exit(128 + number)
 
-    if threading.current_thread() is not threading.main_thread():  # which alone may say what a signal does
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may set a signal handler
         yield
         return
     before = signal.signal(signal.SIGTERM, stop)
@@ -158,8 +160,8 @@ def _stoppable() -> Iterator[None]:
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    """A path beside, which takes its place when all went well."""
+def _replaced_on_success(path: Path) -> Iterator[Path]:
+    """A temporary path in the same folder, which replaces ``path`` on success."""
     part = path.with_name(f".{path.name}.part")
     try:
         yield part
@@ -168,22 +170,22 @@ def _beside(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def _run(told: Retold, translator: Translator | None, file: McapFile | None) -> str:
-    """Play it; returns why it ended before its end, empty if it did not."""
+def _run(source: RecordingSource, translator: Translator | None, file: McapFile | None) -> str:
+    """Replay; returns why it ended early, empty where it did not."""
     due, begun = FIRST_MAP, time.monotonic()
     shown, every = begun, 1.0 if sys.stderr.isatty() else IN_A_LOG_S
     try:
-        for frame in told.frames(raw=file is not None):
+        for frame in source.frames(raw=file is not None):
             if translator is None or file is None:
                 continue
-            for out in translator.take(frame):
+            for out in translator.convert(frame):
                 file.write(out)
-            if told.rerun.ledger.keyframes >= due:
-                due = int(GROWTH * told.rerun.ledger.keyframes) + 1
-                _draw(told, translator, file)
+            if source.rerun.ledger.keyframes >= due:
+                due = int(GROWTH * source.rerun.ledger.keyframes) + 1
+                _draw(source, translator, file)
             if time.monotonic() - shown > every:
                 shown = time.monotonic()
-                _say(progress(told.source.done, told.source.total, shown - begun))
+                _say(progress(source.source.done, source.source.total, shown - begun))
     except HalError as error:
         return str(error)
     finally:
@@ -193,18 +195,18 @@ def _run(told: Retold, translator: Translator | None, file: McapFile | None) -> 
 
 
 def progress(done: int, total: int, seconds: float) -> str:
-    """How much has been done in so many seconds, and how long the rest takes at that pace."""
+    """Progress text: share done, and the time left at the present rate."""
     share = done / max(1, total)
-    if share < 0.01:  # what is opened first tells nothing of the pace
+    if share < 0.01:  # too early for a rate
         return "export: 0 %"
     left = seconds * (1.0 - share) / share
     return f"export: {100 * share:.0f} %, {f'{left:.0f} s' if left < 100.0 else f'{left / 60.0:.0f} min'} left"
 
 
-def _draw(told: Retold, translator: Translator, file: McapFile) -> None:
-    grid = told.rerun.render()
+def _draw(source: RecordingSource, translator: Translator, file: McapFile) -> None:
+    grid = source.rerun.render()
     corner = (float(grid.origin[0]), float(grid.origin[1]))
-    for out in translator.grid(told.rerun.t_mono, corner, grid.resolution, grid.log_odds):
+    for out in translator.grid(source.rerun.t_mono, corner, grid.resolution, grid.log_odds):
         file.write(out)
 
 

@@ -1,8 +1,7 @@
-"""`lumiloop record-mcap OUT.mcap`: what a running daemon tells, as an MCAP file of ROS 2 messages, until interrupted.
+"""`lumiloop record-mcap OUT.mcap`: records the running daemon's stream as an MCAP file of ROS 2 messages.
 
-It ends while the disk still has room for the daemon's maps (``--reserve``). A recorder that is killed leaves a file
-without an index, which lacks at most half a second; `lumiloop export FILE.mcap --mcap WHOLE.mcap` makes a whole one of
-it.
+It stops while the disk still has room for the daemon's maps (``--reserve``). A killed recorder leaves a file without an
+index that lacks at most half a second; `lumiloop export FILE.mcap --mcap WHOLE.mcap` recovers it.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ import contextlib
 from pathlib import Path
 from typing import Final
 
-from daemon.cli import parser
 from daemon.config.schema import Config
-from hal.run_server import work_until_told
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import Hello, NotTheStream
+from daemon.system import console
+from hal.run_server import run_until_stopped
 from taps.mcap.writer import FLUSH_S, McapFile, NoRoom
 from taps.ros.messages import Translator
-from taps.stream.client import Lost, Stream
-from taps.stream.messages import Hello, NotTheStream
 
 TOPICS: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
 
@@ -27,46 +26,48 @@ TOPICS: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistic
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.out.exists() and not args.force:
-        return parser.fail(f"{args.out} is there already; name another file, or replace it with --force", parser.USAGE)
+        return console.fail(
+            f"{args.out} is there already; name another file, or replace it with --force", console.USAGE
+        )
     if not args.out.parent.is_dir():
-        return parser.fail(
-            f"{args.out}: there is no folder {args.out.parent}; make it, or name another file", parser.USAGE
+        return console.fail(
+            f"{args.out}: there is no folder {args.out.parent}; make it, or name another file", console.USAGE
         )
     stream = Stream(args.stream or args.settings.name, (*TOPICS, *(["raw"] if args.raw else [])))
     file = None
     try:
         with McapFile(args.out, reserve=round(args.reserve * (1 << 20))) as file:
-            asyncio.run(work_until_told(record(stream, args.settings, file), seconds=args.seconds or 0.0))
+            asyncio.run(run_until_stopped(record(stream, args.settings, file), seconds=args.seconds or 0.0))
     except NotTheStream as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except NoRoom as error:
         whole = "the file is whole up to here; " if file is not None and file.messages else ""
-        return parser.fail(f"{args.out}: stopped, {error}: {whole}free space, or name another disk")
+        return console.fail(f"{args.out}: stopped, {error}: {whole}free space, or name another disk")
     except OSError as error:
-        return parser.fail(f"{args.out}: {error.strerror}; free space or name another file")
+        return console.fail(f"{args.out}: {error.strerror}; free space or name another file")
     finally:
         if file is not None and not file.messages:
-            _leave_none(args.out)
+            _remove_if_file(args.out)
     if not file.messages:
-        return parser.fail("nothing was told, and no file is left; is the daemon running?")
-    parser.say(f"{args.out}: {file.messages} messages")
-    return parser.OK
+        return console.fail("nothing was told, and no file is left; is the daemon running?")
+    console.say(f"{args.out}: {file.messages} messages")
+    return console.OK
 
 
-def _leave_none(path: Path) -> None:
-    """An empty file is worth nothing, and who keeps so many of the latest files would give up a full one for it."""
-    if path.is_file():  # and no device
+def _remove_if_file(path: Path) -> None:
+    """Remove an empty file: a rotation of the latest files would delete a full one for it."""
+    if path.is_file():  # not a device
         with contextlib.suppress(OSError):
             path.unlink()
 
 
 async def record(stream: Stream, settings: Config, file: McapFile) -> None:
-    """Write all that is told, until cancelled.
+    """Write the stream until cancelled.
 
     Raises:
         NotTheStream: the other end is no daemon of this version.
         OSError: the file cannot be written.
-        NoRoom: its disk has no room but what is to stay free.
+        NoRoom: its disk has no room beyond the reserve.
     """
     translator = Translator(settings.lidar.mount)
     flushing = asyncio.ensure_future(_flush(file))
@@ -74,12 +75,12 @@ async def record(stream: Stream, settings: Config, file: McapFile) -> None:
         async with contextlib.aclosing(stream.frames()) as frames:
             async for frame in frames:
                 if isinstance(frame, Lost):
-                    parser.say(f"{frame.text}; waiting")
+                    console.say(f"{frame.text}; waiting")
                 elif isinstance(frame, Hello):
-                    parser.say(f"recording {frame.name} into {file.path}")
+                    console.say(f"recording {frame.name} into {file.path}")
                     translator = Translator(settings.lidar.mount)
                 else:
-                    for out in translator.take(frame):
+                    for out in translator.convert(frame):
                         file.write(out)
     finally:
         flushing.cancel()
@@ -87,9 +88,9 @@ async def record(stream: Stream, settings: Config, file: McapFile) -> None:
 
 
 async def _flush(file: McapFile) -> None:
-    """What has been told reaches the kernel also when nothing more comes."""
+    """Flush buffered messages also when no further ones arrive."""
     while True:
         await asyncio.sleep(FLUSH_S)
         if file.waiting:
-            with contextlib.suppress(NoRoom):  # the next message says it
+            with contextlib.suppress(NoRoom):  # the next message raises it again
                 file.flush()

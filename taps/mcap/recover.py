@@ -1,6 +1,6 @@
-"""MCAP files whose writer was killed, or that were cut: what is whole in them goes into a file that is whole.
+"""Recovers truncated MCAP files: copies their intact messages into a complete file with an index.
 
-An unfinished file has no index, and tools that need one refuse it. Its chunks are whole up to the last one written.
+A file whose writer was killed has no index, and many tools refuse it. Its chunks are intact up to the last one written.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from zstandard import ZstdError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LONGEST: Final = 256 << 20
-"""Bytes of a record; what is longer is damage."""
+"""Most bytes of a record; a longer one is damage."""
 
 
 CUT: Final = "its writer still writes or was killed, or the disk was full"
-"""What leaves a file without an end."""
+"""Possible causes of a file without an end."""
 
 
 class NotMcap(Exception):
-    """This is no MCAP file, or nothing of it can be read; the text says what, and what to do."""
+    """Not an MCAP file, or nothing of it is readable; the text gives the cause and a remedy."""
 
 
 @dataclass(slots=True)
 class Recovered:
-    """What was found: messages, from when to when (ns), and why it ended before its end; empty: it was whole."""
+    """The result: messages, time span (ns), and why the file ended early; empty: it was complete."""
 
     messages: int = 0
     first_ns: int = 0
@@ -40,17 +40,17 @@ class Recovered:
     torn: str = ""
 
     def sentence(self) -> str:
-        """For a person."""
+        """The result as text."""
         span = (self.last_ns - self.first_ns) * 1e-9
         ended = "the file was whole" if not self.torn else f"the file ends there: {self.torn}"
         return f"{self.messages} messages over {span:.1f} s; {ended}"
 
 
 def recover(source: Path, target: Path) -> Recovered:
-    """Copy all that is whole, with an index.
+    """Copy all intact messages, with an index.
 
     Raises:
-        NotMcap: there is nothing that could be copied.
+        NotMcap: no intact message.
         OSError: a file cannot be read or written.
     """
     found = Recovered()
@@ -58,17 +58,17 @@ def recover(source: Path, target: Path) -> Recovered:
         if data.read(len(MAGIC)) != MAGIC:
             raise NotMcap(f"{source} is no MCAP file: it does not begin as one")
         data.seek(0)
-        beside = target.with_name(f".{target.name}.part")
+        temporary = target.with_name(f".{target.name}.part")
         try:
-            with beside.open("wb") as out:
+            with temporary.open("wb") as out:
                 _copy(data, out, found)
             if not found.messages:
                 raise NotMcap(
                     f"{source} holds no whole message: {found.torn or 'it is empty'}; there is nothing to save"
                 )
-            beside.replace(target)
+            temporary.replace(target)
         finally:
-            beside.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
     return found
 
 
@@ -77,7 +77,7 @@ def _copy(data: IO[bytes], out: IO[bytes], found: Recovered) -> None:
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}
     begun = False
-    for record in _whole(data, found):
+    for record in _intact(data, found):
         if isinstance(record, Header) and not begun:
             writer.start(record.profile, record.library)
             begun = True
@@ -94,11 +94,11 @@ def _copy(data: IO[bytes], out: IO[bytes], found: Recovered) -> None:
             found.first_ns = min(found.first_ns, record.log_time) if found.messages else record.log_time
             found.last_ns = max(found.last_ns, record.log_time)
             found.messages += 1
-    writer.finish()  # type: ignore[no-untyped-call]  # mcap's own is not typed
+    writer.finish()  # type: ignore[no-untyped-call]  # the mcap library is not typed
 
 
-def _whole(data: IO[bytes], found: Recovered) -> Iterator[McapRecord]:
-    """Records up to the end, or to what is torn."""
+def _intact(data: IO[bytes], found: Recovered) -> Iterator[McapRecord]:
+    """Intact records, up to the end or the first damage."""
     records = StreamReader(data, validate_crcs=True, record_size_limit=LONGEST).records
     ended = False
     while True:

@@ -1,4 +1,4 @@
-"""An MCAP file of ROS 2 messages (mcap.dev, profile ``ros2``), written so that a killed writer loses half a second."""
+"""Writes an MCAP file of ROS 2 messages (mcap.dev, profile ``ros2``); a killed writer loses at most half a second."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from mcap.writer import CompressionType, Writer
 
 from daemon.system.versions import release
 from taps.ros import types
-from taps.ros.messages import TOPICS, Out
+from taps.ros.messages import TOPICS, RosMessage
 
 PROFILE: Final = "ros2"
 CHUNK_BYTES: Final = 1 << 20
 FLUSH_S: Final = 0.25
-"""Of the messages' own time: a chunk is closed, and given to the kernel, when it is so long."""
+"""Longest chunk, in the messages' own time; then it is closed and passed to the kernel."""
 
 
 class NoRoom(Exception):
-    """There is less room than is to be left free; says how much."""
+    """The disk has less free space than the reserve; the text gives both."""
 
 
 _QOS: Final = """- history: 3
@@ -36,25 +36,25 @@ _QOS: Final = """- history: 3
 
 
 class McapFile:
-    """A file that is being written; a context.
+    """An open MCAP file; a context manager.
 
     Attributes:
-        path: of it. messages: written. waiting: of them in memory.
+        path: of the file. messages: number written. waiting: number of them still in memory.
 
     Args:
-        flush_s: at most so much of the messages' time waits in memory; 0: as long as a chunk lasts.
-        reserve: bytes that stay free on the disk; what would take of them is not written.
+        flush_s: longest time span of buffered messages, s; 0: a whole chunk.
+        reserve: bytes that stay free on the disk.
 
     Raises:
-        OSError: it cannot be written.
-        NoRoom: there is less than the reserve; nothing has been begun.
+        OSError: the file cannot be written.
+        NoRoom: less free space than the reserve; no file was made.
     """
 
     def __init__(self, path: Path, flush_s: float = FLUSH_S, reserve: int = 0) -> None:
         self.path, self.messages, self.waiting = path, 0, 0
         self._flush_ns = round(1e9 * flush_s)
         self._reserve = reserve
-        self._guard()
+        self._check_reserve()
         self._stream: IO[bytes] = path.open("wb")
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(PROFILE, f"lumiloop {release()}")
@@ -70,8 +70,8 @@ class McapFile:
     ) -> None:
         self.close()
 
-    def write(self, out: Out) -> None:
-        """One message; raises `NoRoom`, and then what has been written can still be closed as a whole file."""
+    def write(self, out: RosMessage) -> None:
+        """Write one message; after `NoRoom` the file can still be closed as a complete one."""
         if (channel := self._channels.get(out.topic)) is None:
             channel = self._channels[out.topic] = self._open(out.topic)
         self._writer.add_message(channel, out.t_ns, out.data, out.t_ns, self.messages & 0xFFFFFFFF)
@@ -83,13 +83,13 @@ class McapFile:
             self._begun = out.t_ns
 
     def flush(self) -> None:
-        """Close the chunk and give it to the kernel: a process that is killed now loses nothing of it.
+        """Close the chunk and pass it to the kernel, so that a killed process loses nothing of it.
 
         Raises:
-            NoRoom: it would take of the reserve.
+            NoRoom: it would use the reserve.
         """
-        self._guard()
-        # the library closes chunks by size alone; a test holds it to this name
+        self._check_reserve()
+        # the library closes chunks by size only; a test checks that this name exists
         getattr(self._writer, "_Writer__finalize_chunk")()  # noqa: B009 - a private name of another class
         self._stream.flush()
         self.waiting = 0
@@ -98,11 +98,11 @@ class McapFile:
         """Write the index; idempotent."""
         if not self._stream.closed:
             try:
-                self._writer.finish()  # type: ignore[no-untyped-call]  # mcap's own is not typed
+                self._writer.finish()  # type: ignore[no-untyped-call]  # the mcap library is not typed
             finally:
                 self._stream.close()
 
-    def _guard(self) -> None:
+    def _check_reserve(self) -> None:
         if self._reserve and not _is_device(self.path):
             free = free_bytes(self.path.parent)
             if free < self._reserve:
@@ -119,10 +119,10 @@ class McapFile:
 
 
 def free_bytes(folder: Path) -> int:
-    """Room on the disk of a folder."""
+    """Free bytes on the disk of a folder."""
     return shutil.disk_usage(folder).free
 
 
 def _is_device(path: Path) -> bool:
-    """Whether what is written takes no room on the disk."""
+    """Whether the path is a device, which uses no disk space."""
     return path.exists() and not path.is_file()

@@ -1,1 +1,1 @@
-"""Prometheus metrics and the VDA 5050 position object over HTTP."""
+"""HTTP server of Prometheus metrics and of the VDA 5050 position object."""

@@ -1,4 +1,4 @@
-"""What the daemon tells, as Prometheus reads it: text exposition format 0.0.4. Records in, text out, no I/O."""
+"""Converts stream messages to Prometheus metrics (text exposition format 0.0.4). No I/O."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Final
 
 import msgspec
 
+from daemon.publish.stream.client import Lost
+from daemon.publish.stream.messages import Faults, Frame, Hello, Lights, Pose, Statistics
 from daemon.snapshot import LinkUse, Part, Stage, State
-from taps.stream.client import Lost
-from taps.stream.messages import Faults, Frame, Hello, Lights, Pose, Statistics
 
 OLD_S: Final = 3.0
-"""A daemon that has told no pose for so long does not know where the robot is; without any word it stands."""
+"""A pose older than this is not valid; a daemon without any message for this long counts as down."""
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _QUANTILES: Final = ("0.5", "0.99", "1")
 _COUNTERS: Final = {
@@ -36,12 +36,12 @@ Sample = tuple[Labels, float]
 
 
 @dataclass(slots=True)
-class Told:
-    """The latest of everything.
+class Latest:
+    """The latest message of each kind.
 
     Attributes:
-        up: whether the daemon is there. held: the last frame with a pose of this run of it, also when it has gone.
-        t_heard: when the latest pose came. t_spoke: when anything came.
+        up: whether the daemon is connected. held: the last message with a pose of this run, also after a loss.
+        t_pose: arrival of the latest pose message. t_message: arrival of the latest message.
     """
 
     up: bool = False
@@ -51,29 +51,29 @@ class Told:
     lights: Lights | None = None
     faults: Faults | None = None
     statistics: Statistics | None = None
-    t_heard: float = -math.inf
-    t_spoke: float = -math.inf
+    t_pose: float = -math.inf
+    t_message: float = -math.inf
 
-    def answers(self, now: float) -> bool:
-        """Whether the daemon is there and speaks; one that stands keeps its connection, and says nothing."""
-        return self.up and now - self.t_spoke <= OLD_S
+    def alive(self, now: float) -> bool:
+        """Whether the daemon is connected and sends; a hanging one keeps its connection but is silent."""
+        return self.up and now - self.t_message <= OLD_S
 
     def latest(self, now: float) -> Pose | None:
-        """The pose told last; once the daemon has gone, or stood for :data:`OLD_S`, without a place in the map."""
-        if self.pose is not None and now - self.t_heard <= OLD_S:
+        """The latest pose message; without a pose once the daemon is gone, or has been silent for :data:`OLD_S`."""
+        if self.pose is not None and now - self.t_pose <= OLD_S:
             return self.pose
         return None if self.held is None else msgspec.structs.replace(self.held, pose=None)
 
-    def take(self, frame: Frame | Lost, now: float) -> None:
-        """Take one in, at ``now`` of our own clock (CLOCK_MONOTONIC, which is also the daemon's)."""
-        self.t_spoke = now
+    def update(self, frame: Frame | Lost, now: float) -> None:
+        """Store one message; ``now``: CLOCK_MONOTONIC, which is also the daemon's clock."""
+        self.t_message = now
         match frame:
             case Lost():
                 self.up, self.pose, self.lights, self.faults, self.statistics = False, None, None, None, None
-            case Hello():  # of another run: where the one before lost its pose says nothing of where the robot is now
+            case Hello():  # another run: the last pose of the run before is not valid any more
                 self.up, self.hello, self.held = True, frame, None
             case Pose():
-                self.pose, self.t_heard = frame, now
+                self.pose, self.t_pose = frame, now
                 self.held = frame if frame.pose is not None else self.held
             case Lights():
                 self.lights = frame
@@ -85,28 +85,28 @@ class Told:
                 return
 
 
-def exposition(told: Told, now: float) -> str:
+def exposition(latest: Latest, now: float) -> str:
     """Every series, with help and type."""
-    return "".join(_family(*family) for family in _families(told, now))
+    return "".join(_family(*family) for family in _families(latest, now))
 
 
-def _families(told: Told, now: float) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
-    answers = told.answers(now)
-    yield "lumiloop_up", "gauge", "whether the daemon answers", [({}, float(answers))]
-    if not answers:
+def _families(latest: Latest, now: float) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
+    alive = latest.alive(now)
+    yield "lumiloop_up", "gauge", "whether the daemon alive", [({}, float(alive))]
+    if not alive:
         return
-    if told.hello is not None:
-        yield "lumiloop_info", "gauge", "name of the robot", [({"robot": told.hello.name}, 1.0)]
-    if told.pose is not None:
-        yield from _of_pose(told.pose, now)
-    if told.lights is not None and told.lights.t_mono is not None:
-        yield from _of_lights(told.lights)
-    if told.faults is not None:
-        present = [({"fault": str(one.fault), "meaning": one.meaning}, 1.0) for one in told.faults.present]
+    if latest.hello is not None:
+        yield "lumiloop_info", "gauge", "name of the robot", [({"robot": latest.hello.name}, 1.0)]
+    if latest.pose is not None:
+        yield from _of_pose(latest.pose, now)
+    if latest.lights is not None and latest.lights.t_mono is not None:
+        yield from _of_lights(latest.lights)
+    if latest.faults is not None:
+        present = [({"fault": str(one.fault), "meaning": one.meaning}, 1.0) for one in latest.faults.present]
         yield "lumiloop_fault", "gauge", "1 for each fault that is present", present
         yield "lumiloop_faults_present", "gauge", "how many are", [({}, float(len(present)))]
-    if told.statistics is not None:
-        yield from _of_statistics(told.statistics)
+    if latest.statistics is not None:
+        yield from _of_statistics(latest.statistics)
 
 
 def _of_pose(pose: Pose, now: float) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
@@ -184,8 +184,8 @@ def _family(name: str, kind: str, what: str, samples: Iterable[Sample]) -> str:
 
 
 def _labels(labels: Labels) -> str:
-    told = ",".join(f'{key}="{_escaped(value)}"' for key, value in labels.items())
-    return f"{{{told}}}" if told else ""
+    pairs = ",".join(f'{key}="{_escaped(value)}"' for key, value in labels.items())
+    return f"{{{pairs}}}" if pairs else ""
 
 
 def _escaped(text: str) -> str:

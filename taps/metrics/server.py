@@ -1,6 +1,6 @@
-"""`lumiloop metrics`: Prometheus' /metrics and VDA 5050's position object, over HTTP, on this computer only by default.
+"""`lumiloop metrics`: an HTTP server of Prometheus metrics and the VDA 5050 position, on loopback by default.
 
-A server of its own in a few lines: two documents that are made when somebody asks, one request a connection.
+A minimal server: two documents, built on request, one request per connection.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import json
 import time
 from typing import Final
 
-from daemon.cli import parser
 from daemon.config.endpoints import in_url, parse_endpoint
-from hal.run_server import work_until_told
+from daemon.publish.stream.client import Stream
+from daemon.publish.stream.messages import NotTheStream
+from daemon.system import console
+from hal.run_server import run_until_stopped
+from taps.access_guard import Guard
 from taps.metrics import vda5050
-from taps.metrics.metrics import CONTENT_TYPE, Told, exposition
-from taps.stream.client import Stream
-from taps.stream.messages import NotTheStream
-from taps.view.access_guard import Guard
+from taps.metrics.metrics import CONTENT_TYPE, Latest, exposition
 
 LONGEST_REQUEST: Final = 8192
 PATIENCE_S: Final = 5.0
@@ -42,43 +42,43 @@ def main(args: argparse.Namespace) -> int:
     try:
         host, port = parse_endpoint(args.listen)
         stream = Stream(args.stream or args.settings.name, TOPICS)
-        asyncio.run(work_until_told(serve(stream, host, port)))
+        asyncio.run(run_until_stopped(serve(stream, host, port)))
     except ValueError as error:
-        return parser.fail(f"--listen: {error}", parser.USAGE)
+        return console.fail(f"--listen: {error}", console.USAGE)
     except NotTheStream as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
     except OSError as error:
-        return parser.fail(f"cannot listen on {args.listen}: {error.strerror}; free it, or name another with --listen")
-    return parser.OK
+        return console.fail(f"cannot listen on {args.listen}: {error.strerror}; free it, or name another with --listen")
+    return console.OK
 
 
 async def serve(stream: Stream, host: str, port: int) -> None:
-    """Listen to the daemon and answer until cancelled.
+    """Read the stream and answer requests until cancelled.
 
     Raises:
-        OSError: it cannot be listened there. NotTheStream: the other end is no daemon of this version.
+        OSError: the address cannot be used. NotTheStream: the other end is no daemon of this version.
     """
-    told = Told()
-    answering = Answering(told, Guard(bind=host))
-    server = await asyncio.start_server(answering, host, port, limit=LONGEST_REQUEST)
-    parser.say(f"http://{in_url(host)}:{server.sockets[0].getsockname()[1]}/metrics")
+    messages = Latest()
+    handler = HttpHandler(messages, Guard(bind=host))
+    server = await asyncio.start_server(handler, host, port, limit=LONGEST_REQUEST)
+    console.say(f"http://{in_url(host)}:{server.sockets[0].getsockname()[1]}/metrics")
     try:
         async with contextlib.aclosing(stream.frames()) as frames:
             async for frame in frames:
-                told.take(frame, time.monotonic())
+                messages.update(frame, time.monotonic())
     finally:
         server.close()
 
 
-class Answering:
-    """Answers requests of what has been told; not those that somebody's web page makes a browser here send."""
+class HttpHandler:
+    """Answers HTTP requests from the latest messages; rejects requests that a foreign web page makes a browser send."""
 
-    def __init__(self, told: Told, guard: Guard) -> None:
-        self._told, self._guard = told, guard
+    def __init__(self, messages: Latest, guard: Guard) -> None:
+        self._messages, self._guard = messages, guard
         self._clients = 0
 
     async def __call__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """One request; whoever sends none in time, or is one too many, is let go."""
+        """Serve one request; a slow client, and one above the limit, is disconnected."""
         self._clients += 1
         try:
             if self._clients <= CLIENTS:
@@ -96,7 +96,7 @@ class Answering:
         words = request.partition(b"\r\n")[0].decode("latin-1").split(" ")
         if len(words) != 3 or not words[2].startswith("HTTP/1."):
             return _response(400, "text/plain", "not a request of HTTP/1\n")
-        if not self._is_ours(request):
+        if not self._host_allowed(request):
             return _response(
                 403, "text/plain", "this computer is asked under a name that is not its own: use its address\n"
             )
@@ -106,23 +106,23 @@ class Answering:
         status, kind, body = self._document(path)
         return _response(status, kind, body, head=method == "HEAD")
 
-    def _is_ours(self, request: bytes) -> bool:
-        """Browsers always say which name they ask; other programs need not."""
+    def _host_allowed(self, request: bytes) -> bool:
+        """Check the Host header: browsers always send one, other programs need not."""
         named = [line.partition(b":")[2] for line in request.split(b"\r\n")[1:] if line.lower().startswith(b"host:")]
         return all(not self._guard.local or self._guard.host_ok(one.decode("latin-1").strip()) for one in named)
 
     def _document(self, path: str) -> tuple[int, str, str]:
-        told = self._told
+        messages = self._messages
         match path:
             case "/metrics":
-                return 200, CONTENT_TYPE, exposition(told, time.monotonic())
+                return 200, CONTENT_TYPE, exposition(messages, time.monotonic())
             case "/vda5050" | "/vda5050/2":
                 second = path.endswith("2")
                 make = vda5050.position_v2 if second else vda5050.position
-                latest = told.latest(time.monotonic())
-                made = None if latest is None else make(latest, told.held)
+                latest = messages.latest(time.monotonic())
+                made = None if latest is None else make(latest, messages.held)
                 if made is None:
-                    why = "the daemon does not answer" if not told.up else "there is no pose yet"
+                    why = "the daemon does not answer" if not messages.up else "there is no pose yet"
                     return 503, _JSON, json.dumps({"error": why}) + "\n"
                 return 200, _JSON, json.dumps({"agvPosition" if second else "mobileRobotPosition": made}) + "\n"
             case "/":

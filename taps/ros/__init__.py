@@ -1,1 +1,1 @@
-"""ROS 2 messages of the stream, and a ROS 2 node without ROS."""
+"""ROS 2: the stream as ROS 2 messages, and a node over Zenoh without a ROS installation."""

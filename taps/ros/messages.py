@@ -1,6 +1,6 @@
-"""What the stream tells, as ROS 2 messages: one translation for files, live servers and replayed recordings.
+"""Converts stream messages to ROS 2 messages, for files, live servers and replayed recordings.
 
-Frames of coordinates after REP-103 and REP-105: ``map`` > ``odom`` > ``base_link`` > ``laser``. The pose in the map may
+Coordinate frames after REP-103 and REP-105: ``map`` > ``odom`` > ``base_link`` > ``laser``. The pose in the map may
 jump, the one in ``odom`` does not.
 """
 
@@ -14,24 +14,36 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.config.schema import Mount
+from daemon.publish.stream.messages import (
+    Faults,
+    Frame,
+    Lights,
+    Loop,
+    MapTiles,
+    Pose,
+    Raw,
+    Scan,
+    StateChange,
+    Statistics,
+    Triple,
+)
 from daemon.snapshot import GUESSED, State
 from taps.ros import types as ros
-from taps.stream.messages import Faults, Frame, Lights, Loop, MapTiles, Pose, Raw, Scan, StateChange, Statistics, Triple
-from taps.stream.tiles import Tiles, trinary
+from taps.stream.tiles import TileMap, trinary
 
 MAP, ODOM, BASE, LASER = "map", "odom", "base_link", "laser"
 
 STEP_S: Final = 0.5
-"""The computer's calendar may be put right by less without the stamps jumping."""
-AGAIN_S: Final = 5.0
-"""What stands still is said again so often, for those who came later."""
+"""A smaller correction of the computer's UTC does not change the stamps."""
+REPEAT_S: Final = 5.0
+"""Period at which static data are repeated, for late subscribers."""
 SLOWEST_HZ: Final = 1.0
-"""Of diagnostics."""
+"""Lowest rate of diagnostics."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic: type, what it is, whether a late listener gets the last one (transient local)."""
+    """A topic: type, description, whether a late subscriber receives the last message (transient local)."""
 
     kind: str
     what: str
@@ -58,15 +70,15 @@ OK, WARN, ERROR = 0, 1, 2
 
 
 @dataclass(frozen=True, slots=True)
-class Out:
-    """One message: where to, when (ns since the Unix epoch), and its bytes."""
+class RosMessage:
+    """One encoded message: topic, time (ns since the Unix epoch), CDR bytes."""
 
     topic: str
     t_ns: int
     data: bytes
 
 
-def beside(T: Triple, odom: Triple) -> Triple:
+def map_to_odom(T: Triple, odom: Triple) -> Triple:
     """``T_map_odom`` of ``T_map_base`` and ``T_odom_base``."""
     turn = math.remainder(T[2] - odom[2], 2.0 * math.pi)
     c, s = math.cos(turn), math.sin(turn)
@@ -74,11 +86,10 @@ def beside(T: Triple, odom: Triple) -> Triple:
 
 
 class Translator:
-    """Frames of the stream in, messages out.
+    """Converts stream messages to ROS 2 messages.
 
     Args:
-        mount: of the lidar. utc: of an instant of the daemon's clock; None: as the poses say, and nothing before the
-            first of them.
+        mount: of the lidar. utc: maps ``t_mono`` to UTC (s); None: from the poses, with no message before the first.
     """
 
     def __init__(self, mount: Mount, utc: Callable[[float], float] | None = None) -> None:
@@ -90,19 +101,19 @@ class Translator:
         self._faults: Faults | None = None
         self._statistics: Statistics | None = None
         self._lights: Lights | None = None
-        self._tiles = Tiles()
+        self._tiles = TileMap()
         self._drawn = -math.inf
         self._now = 0.0
 
-    def take(self, frame: Frame) -> Iterator[Out]:
-        """Every message that comes of a frame."""
+    def convert(self, frame: Frame) -> Iterator[RosMessage]:
+        """The ROS 2 messages of one stream message."""
         match frame:
             case Pose():
                 yield from self._pose(frame)
             case Scan():
                 yield from self._scan(frame)
             case Lights():
-                yield from self._told_by_light(frame)
+                yield from self._lights_message(frame)
             case Loop():
                 yield from self._loop(frame)
             case Raw():
@@ -114,10 +125,12 @@ class Translator:
             case Statistics():
                 self._statistics = frame
             case MapTiles():
-                self._tiles.take(frame)
+                self._tiles.update(frame)
 
-    def grid(self, t_mono: float, origin: tuple[float, float], resolution: float, log_odds: Any) -> Iterator[Out]:
-        """The map as a whole: (rows, columns) log-odds, rows from below, 0 not known."""
+    def grid(
+        self, t_mono: float, origin: tuple[float, float], resolution: float, log_odds: Any
+    ) -> Iterator[RosMessage]:
+        """The map as a whole: (rows, columns) log-odds, rows from below, 0 unknown."""
         t = self._at(t_mono)
         if t is None or log_odds.size == 0:
             return
@@ -133,29 +146,29 @@ class Translator:
         yield self._out("/map", t, header=ros.header(t, MAP), info=info, data=cells.ravel())
 
     def _at(self, t_mono: float) -> float | None:
-        """UTC of an instant; None while it is not known."""
+        """UTC (s) of ``t_mono``; None while unknown."""
         if self._utc is not None:
             return self._utc(t_mono)
         return None if self._offset is None else self._offset + t_mono
 
-    def _out(self, topic: str, t: float, **fields: Any) -> Out:
+    def _out(self, topic: str, t: float, **fields: Any) -> RosMessage:
         kind = TOPICS[topic].kind
-        return Out(topic, ros.nanoseconds(t), ros.encode(kind, ros.make(kind, **fields)))
+        return RosMessage(topic, ros.nanoseconds(t), ros.encode(kind, ros.make(kind, **fields)))
 
-    def _pose(self, frame: Pose) -> Iterator[Out]:
+    def _pose(self, frame: Pose) -> Iterator[RosMessage]:
         offset = frame.utc(0.0)
         if self._offset is None or abs(offset - self._offset) > STEP_S:
             self._offset = offset
         t = self._at(frame.t_mono)
         assert t is not None
         self._now = frame.t_mono
-        yield from self._standing(t)
+        yield from self._static_transforms(t)
         yield from self._map()
         if frame.odom is not None:
             yield self._odom(t, frame, frame.odom)
             moving = [ros.transform(t, ODOM, BASE, frame.odom)]
             if frame.pose is not None:
-                moving.insert(0, ros.transform(t, MAP, ODOM, beside(frame.pose, frame.odom)))
+                moving.insert(0, ros.transform(t, MAP, ODOM, map_to_odom(frame.pose, frame.odom)))
             yield self._out("/tf", t, transforms=moving)
         if frame.pose is not None and frame.covariance is not None and frame.state not in GUESSED:
             place = ros.make(
@@ -171,13 +184,13 @@ class Translator:
             self._diagnosed = frame.t_mono
             yield self._out("/diagnostics", t, header=ros.header(t, ""), status=self._statuses(frame))
 
-    def _standing(self, t: float) -> Iterator[Out]:
-        if not 0.0 <= self._now - self._static < AGAIN_S:
+    def _static_transforms(self, t: float) -> Iterator[RosMessage]:
+        if not 0.0 <= self._now - self._static < REPEAT_S:
             self._static = self._now
             T = (self._mount.x, self._mount.y, math.radians(self._mount.yaw))
             yield self._out("/tf_static", t, transforms=[ros.transform(t, BASE, LASER, T, self._mount.inverted)])
 
-    def _odom(self, t: float, frame: Pose, odom: Triple) -> Out:
+    def _odom(self, t: float, frame: Pose, odom: Triple) -> RosMessage:
         nothing = np.zeros(36)
         vx, vy, turning = frame.velocity or (0.0, 0.0, 0.0)
         twist = ros.make(
@@ -194,7 +207,7 @@ class Translator:
             twist=ros.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=nothing),
         )
 
-    def _changed(self, t: float, frame: Pose) -> Out:
+    def _changed(self, t: float, frame: Pose) -> RosMessage:
         level = frame.trust.horizontal_m
         return self._out(
             "/lumiloop/state",
@@ -208,7 +221,7 @@ class Translator:
             alert=frame.trust.alert,
         )
 
-    def _scan(self, frame: Scan) -> Iterator[Out]:
+    def _scan(self, frame: Scan) -> Iterator[RosMessage]:
         t = self._at(frame.t_mono)
         if t is None:
             return
@@ -228,7 +241,7 @@ class Translator:
             intensities=np.empty(0, np.float32),
         )
 
-    def _told_by_light(self, frame: Lights) -> Iterator[Out]:
+    def _lights_message(self, frame: Lights) -> Iterator[RosMessage]:
         known = frame.t_mono is not None and (self._lights is None or frame.t_mono != self._lights.t_mono)
         self._lights = frame
         t = None if frame.t_mono is None else self._at(frame.t_mono)
@@ -259,7 +272,7 @@ class Translator:
             links=links,
         )
 
-    def _loop(self, frame: Loop) -> Iterator[Out]:
+    def _loop(self, frame: Loop) -> Iterator[RosMessage]:
         t = self._at(frame.t_mono)
         if t is not None:
             yield self._out(
@@ -273,7 +286,7 @@ class Translator:
                 residual=math.nan if frame.residual is None else frame.residual,
             )
 
-    def _raw(self, frame: Raw) -> Iterator[Out]:
+    def _raw(self, frame: Raw) -> Iterator[RosMessage]:
         t = self._at(frame.t_mono)
         if t is not None:
             yield self._out(
@@ -287,17 +300,17 @@ class Translator:
                 data=np.frombuffer(frame.data, np.uint8),
             )
 
-    def _map(self) -> Iterator[Out]:
-        """The map, when it has changed and some time has gone by."""
-        if self._tiles.fresh and not 0.0 <= self._now - self._drawn < AGAIN_S:
+    def _map(self) -> Iterator[RosMessage]:
+        """The map, if it has changed, at most every :data:`REPEAT_S`."""
+        if self._tiles.changed and not 0.0 <= self._now - self._drawn < REPEAT_S:
             self._drawn = self._now
             corner, whole = self._tiles.whole()
             yield from self.grid(self._now, corner, self._tiles.resolution, whole)
 
     def _statuses(self, frame: Pose) -> list[Any]:
         level = OK if frame.state in WELL else WARN if frame.state in POOR else ERROR
-        said = f"{frame.state_name}: {frame.meaning}" if frame.meaning else frame.state_name
-        found = [_status(level, "state", said, {"remedy": frame.remedy, "jumps": frame.jumps, "map": frame.map_id})]
+        text = f"{frame.state_name}: {frame.meaning}" if frame.meaning else frame.state_name
+        found = [_status(level, "state", text, {"remedy": frame.remedy, "jumps": frame.jumps, "map": frame.map_id})]
         present = () if self._faults is None else self._faults.present
         found += [_status(ERROR, f"fault {one.fault}", one.meaning, {"remedy": one.remedy}) for one in present]
         pulse = frame.pulse
@@ -314,7 +327,7 @@ class Translator:
 
 
 def _status(level: int, name: str, message: str, values: dict[str, Any]) -> Any:
-    told = [
+    pairs = [
         ros.make("diagnostic_msgs/msg/KeyValue", key=key, value="" if value is None else str(value))
         for key, value in values.items()
     ]
@@ -324,5 +337,5 @@ def _status(level: int, name: str, message: str, values: dict[str, Any]) -> Any:
         name=f"lumiloop: {name}",
         message=message,
         hardware_id="",
-        values=told,
+        values=pairs,
     )

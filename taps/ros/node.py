@@ -1,7 +1,7 @@
-"""`lumiloop ros2`: a running daemon as a node of ROS 2, which need not be installed here: rmw_zenoh's convention.
+"""`lumiloop ros2`: the running daemon as a ROS 2 node over Zenoh (rmw_zenoh), without a ROS installation.
 
-The messages are those of the MCAP files. What stands still (map, mount, state) is kept for who comes late, as
-transient local does.
+The messages are those of the MCAP files. Static data (map, mount, state) are kept for late subscribers, as transient
+local durability requires.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from typing import Final
 
 import zenoh
 
-from daemon.cli import parser
-from hal.run_server import work_until_told
+from daemon.publish.stream.client import Stream
+from daemon.publish.stream.messages import NotTheStream
+from daemon.system import console
+from hal.run_server import run_until_stopped
 from taps.ros import rmw_zenoh, types
-from taps.ros.messages import TOPICS, Out
-from taps.stream.client import Stream
-from taps.stream.messages import NotTheStream
-from taps.stream.ros_follower import follow
-from taps.zenoh_session import BadEndpoint, joined, listed, watched, withdraw
+from taps.ros.messages import TOPICS, RosMessage
+from taps.ros.stream_follower import forward
+from taps.zenoh_session import BadEndpoint, list_tokens, open_session, undeclare, watch_router
 
 WANTED: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistics", "map")
 NAME: Final = "lumiloop"
 HEARTBEAT_S: Final = 0.5
-"""Who has missed the last message of a topic that is kept finds out by then, as of rmw_zenoh's own publishers."""
+"""A subscriber that missed the last message of a latched topic detects it within this time, as in rmw_zenoh."""
 
 
 class NameTaken(Exception):
-    """Another node has this name; the text says what to do."""
+    """Another node has this name; the text gives a remedy."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -38,33 +38,33 @@ def main(args: argparse.Namespace) -> int:
     try:
         namespace = rmw_zenoh.namespace_of(args.namespace)
         stream = Stream(args.stream or args.settings.name, WANTED)
-        asyncio.run(work_until_told(serve(args, namespace, stream)))
+        asyncio.run(run_until_stopped(serve(args, namespace, stream)))
     except ValueError as error:
-        return parser.fail(f"--namespace: {error}", parser.USAGE)
+        return console.fail(f"--namespace: {error}", console.USAGE)
     except BadEndpoint as error:
-        return parser.fail(str(error), parser.USAGE)
+        return console.fail(str(error), console.USAGE)
     except (NotTheStream, NameTaken) as error:
-        return parser.fail(str(error))
-    return parser.OK
+        return console.fail(str(error))
+    return console.OK
 
 
 async def serve(args: argparse.Namespace, namespace: str, stream: Stream) -> None:
-    """Join the router and pass on all that is told, until cancelled.
+    """Connect to the router and publish the stream until cancelled.
 
     Raises:
-        BadEndpoint: no such router can be. NameTaken: there is such a node, or one has come that stays.
-        NotTheStream: there is no such daemon.
+        BadEndpoint: invalid endpoint. NameTaken: another node has the name, or has gained it.
+        NotTheStream: the other end is no daemon of this version.
     """
-    async with joined(args.router, args.zenoh) as session:
+    async with open_session(args.router, args.zenoh) as session:
         node = rmw_zenoh.Node(args.domain, str(session.info.zid()), NAME, namespace)
-        if await listed(session, node.others()):
-            raise NameTaken(taken(node))
-        talker = Talker(session, node, args.humble)
-        watching = asyncio.create_task(watched(session, args.router, lambda there: None))
-        work = [asyncio.create_task(rivalled(session, node))]
+        if await list_tokens(session, node.others()):
+            raise NameTaken(name_taken(node))
+        publisher = RosPublisher(session, node, args.humble)
+        watching = asyncio.create_task(watch_router(session, args.router, lambda there: None))
+        work = [asyncio.create_task(wait_for_rival(session, node))]
         try:
-            parser.say(f"node {namespace}/{NAME} in domain {node.domain} by way of {args.router}")
-            work.append(asyncio.create_task(follow(stream, args.settings, talker)))
+            console.say(f"node {namespace}/{NAME} in domain {node.domain} by way of {args.router}")
+            work.append(asyncio.create_task(forward(stream, args.settings, publisher)))
             ended, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
             for task in ended:
                 task.result()
@@ -72,41 +72,42 @@ async def serve(args: argparse.Namespace, namespace: str, stream: Stream) -> Non
             for task in (watching, *work):
                 task.cancel()
             await asyncio.gather(*work, return_exceptions=True)
-            talker.close()
+            publisher.close()
 
 
-def taken(node: rmw_zenoh.Node) -> str:
-    """What to do where two nodes have one name."""
+def name_taken(node: rmw_zenoh.Node) -> str:
+    """Message for two nodes of one name, with a remedy."""
     return (
         f"domain {node.domain} has a node {node.namespace}/{NAME} already: two robots on the same topics would "
         "spoil both; give each a --namespace of its own, or stop the other one"
     )
 
 
-async def rivalled(session: zenoh.Session, node: rmw_zenoh.Node) -> None:
-    """Wait for a node of the same name that has the better right to it: the one with the lesser session.
+async def wait_for_rival(session: zenoh.Session, node: rmw_zenoh.Node) -> None:
+    """Wait for a node of the same name with a smaller session ID, which has precedence.
 
-    Two that join at once, as when both have waited for the router, find nobody before them; so do two that were parted.
+    Two nodes that join at once, as after a wait for the router, do not see each other before; nor do two that were
+    separated.
 
     Raises:
-        NameTaken: there is one.
+        NameTaken: such a node exists.
     """
     loop, met = asyncio.get_running_loop(), asyncio.Event()
 
-    def heard(sample: zenoh.Sample) -> None:
+    def on_token(sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT and rmw_zenoh.session_of(str(sample.key_expr)) < node.session:
             with contextlib.suppress(RuntimeError):  # the loop has closed
                 loop.call_soon_threadsafe(met.set)
 
-    listening = session.liveliness().declare_subscriber(node.others(), heard, history=True)
+    subscriber = session.liveliness().declare_subscriber(node.others(), on_token, history=True)
     try:
         await met.wait()
     finally:
-        withdraw(listening)
-    raise NameTaken(taken(node))
+        undeclare(subscriber)
+    raise NameTaken(name_taken(node))
 
 
-class Talker:
+class RosPublisher:
     """A node with a publisher for each topic."""
 
     def __init__(self, session: zenoh.Session, node: rmw_zenoh.Node, humble: bool = False) -> None:
@@ -132,8 +133,8 @@ class Talker:
             self._publishers[topic] = publisher, rmw_zenoh.gid_of(token)
             self._tokens.append(session.liveliness().declare_token(token))
 
-    def send(self, out: Out) -> None:
-        """One message."""
+    def send(self, out: RosMessage) -> None:
+        """Publish one message."""
         if (found := self._publishers.get(out.topic)) is None:
             return
         publisher, gid = found
@@ -142,4 +143,4 @@ class Talker:
 
     def close(self) -> None:
         """Leave the graph."""
-        withdraw(*self._tokens, *(publisher for publisher, _ in self._publishers.values()))
+        undeclare(*self._tokens, *(publisher for publisher, _ in self._publishers.values()))

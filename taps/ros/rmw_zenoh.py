@@ -1,8 +1,7 @@
-"""How rmw_zenoh, ROS 2's middleware over Zenoh, names and packs messages: pure, text and bytes.
+"""The rmw_zenoh conventions: key expressions, liveliness tokens and attachments of ROS 2 messages. Pure, no I/O.
 
-After its design document (github.com/ros2/rmw_zenoh, docs/design.md, as of Jazzy and later): key expressions,
-liveliness tokens from which `ros2 topic list` is made, and the attachment of every message. The payload is CDR
-(`taps.ros.types`).
+Source: its design document (github.com/ros2/rmw_zenoh, docs/design.md, as of Jazzy and later). `ros2 topic list` reads
+the liveliness tokens. The payload is CDR (`taps.ros.types`).
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Final
 
 ADMIN: Final = "@ros2_lv"
 UNSUPPORTED: Final = "TypeHashNotSupported"
-"""What Humble has in the place of a type's hash."""
+"""Humble's placeholder for a type's hash."""
 DEPTH: Final = 10
 NODE_ID: Final = 0
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
@@ -65,10 +64,10 @@ def session_of(token: str) -> str:
 
 
 def namespace_of(text: str) -> str:
-    """A namespace as a person writes it, with a slash before and none behind.
+    """Normalise a namespace: one leading slash, none at the end.
 
     Raises:
-        ValueError: ROS has no such names.
+        ValueError: not a valid ROS name.
     """
     named = "/" + text.strip("/") if text.strip("/") else ""
     if not _NAMESPACE.fullmatch(named):
@@ -77,23 +76,23 @@ def namespace_of(text: str) -> str:
 
 
 def dds_name(kind: str) -> str:
-    """``sensor_msgs/msg/LaserScan`` as DDS has it."""
+    """The DDS name of a type such as ``sensor_msgs/msg/LaserScan``."""
     package, _, name = kind.split("/")
     return f"{package}::msg::dds_::{name}_"
 
 
 def qos(latched: bool) -> str:
-    """Quality of service as far as it differs from rmw_zenoh's default (reliable, volatile, keep last, 42)."""
+    """Quality of service where it differs from rmw_zenoh's default (reliable, volatile, keep last, 42)."""
     return ":1:,1:,:,:,," if latched else f"::,{DEPTH}:,:,:,,"
 
 
 def attachment(number: int, t_ns: int, gid: bytes) -> bytes:
-    """What goes with a message: its number from 1, when it was sent (ns since the Unix epoch), whose it is."""
+    """Attachment of a message: number from 1, time of sending (ns since the Unix epoch), publisher's ID."""
     return _ATTACHMENT.pack(number, t_ns, _GID, gid)
 
 
 def gid_of(token: str) -> bytes:
-    """16 bytes that no other publisher has. rmw_zenoh takes XXH3 of the token; nobody compares the two."""
+    """Unique 16-byte ID of a publisher. rmw_zenoh uses XXH3 of the token; the two are never compared."""
     return hashlib.blake2b(token.encode(), digest_size=_GID).digest()
 
 

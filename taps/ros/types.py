@@ -1,7 +1,7 @@
-"""The ROS 2 messages that are written: their types, their definitions as text, their encoding (CDR, XCDR1 plain).
+"""ROS 2 message types: definitions, construction, encoding (CDR, XCDR1 plain).
 
-Types of ROS itself are those of Humble, which later releases read; what ROS has no message for has one of our own,
-whose definition travels with every file and connection.
+Standard types are those of Humble, which later releases read. Data without a standard type have a ``lumiloop_msgs``
+type, whose definition is part of every file and connection.
 """
 
 from __future__ import annotations
@@ -73,19 +73,19 @@ def encode(kind: str, message: Any) -> bytes:
 
 
 def definition(kind: str) -> str:
-    """The text of a type and of all it is made of, as MCAP's schema encoding ``ros2msg`` has it."""
+    """The definition of a type with all its parts, in MCAP's schema encoding ``ros2msg``."""
     text, _ = STORE.generate_msgdef(kind, ros_version=2)
     return text
 
 
 def time(t_utc: float) -> Any:
-    """An instant, s since the Unix epoch, as a message."""
+    """A time (s since the Unix epoch) as a message."""
     whole, rest = divmod(nanoseconds(t_utc), 10**9)
     return make("builtin_interfaces/msg/Time", sec=whole, nanosec=rest)
 
 
 def nanoseconds(t_utc: float) -> int:
-    """An instant in ns since the Unix epoch, to the microsecond; what ROS cannot hold is brought to its bounds."""
+    """A time in ns since the Unix epoch, rounded to microseconds, clipped to the range of ROS."""
     return min(max(round(t_utc * 1e6) * 1000, 0), (2**31 - 1) * 10**9)
 
 
@@ -95,14 +95,14 @@ def header(t_utc: float, frame: str) -> Any:
 
 
 def quaternion(yaw: float, inverted: bool = False) -> Any:
-    """A turn about z; ``inverted``: of what hangs upside down (turned about its x by half a turn before)."""
+    """A rotation about z (rad); ``inverted``: preceded by half a turn about x, for an upside-down mount."""
     s, c = float(np.sin(yaw / 2)), float(np.cos(yaw / 2))
     x, y, z, w = (c, s, 0.0, 0.0) if inverted else (0.0, 0.0, s, c)
     return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
 def pose(x: float, y: float, yaw: float) -> Any:
-    """A place on the floor."""
+    """A planar pose (m, m, rad)."""
     point = make("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
     return make("geometry_msgs/msg/Pose", position=point, orientation=quaternion(yaw))
 

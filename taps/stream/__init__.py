@@ -1,1 +1,1 @@
-"""Client of the daemon's local stream and the typed messages on it."""
+"""Sources and parts of the local stream: recordings replayed as a stream, and the map assembled from its tiles."""

@@ -1,50 +1,50 @@
-"""A recording, told as its daemon's stream would have told it: what reads the stream reads recordings, too."""
+"""A recording as a source of stream messages: replayed through the daemon's cycle, as its stream would send it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from daemon.cli.replay import NOTHING_GIVEN, Given, config_for, lights_for, start_for
 from daemon.config.schema import Config
 from daemon.health.reasons import REASONS, Reason
-from daemon.publish import stream_server
-from daemon.publish.stream_server import Client, StreamServer
-from daemon.publish.stream_ticker import BEAT_S, in_words
+from daemon.publish.stream import messages
+from daemon.publish.stream import server as stream_server
+from daemon.publish.stream.messages import Frame, Raw
+from daemon.publish.stream.server import Client, StreamServer
+from daemon.publish.stream.ticker import BEAT_S, in_words
+from daemon.replay.recorded_inputs import NOTHING_GIVEN, Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import Source, open_log
 from hal.adc import RawSamples
 from hal.lidar import RawScan
 from hal.replay.recording import Kind, open_recording
 from hal.replay.report import LogReport
-from taps.stream import messages
-from taps.stream.messages import Frame, Raw
 
 PASSED = {Kind.RX: "rx", Kind.TX: "tx", Kind.OPEN: "open", Kind.LOST: "lost", Kind.BAUD: "baud"}
 
 
-class Listener(Client):
-    """A client of the stream without a socket."""
+class InProcessClient(Client):
+    """A client of the stream server in this process, without a socket."""
 
-    def __init__(self, server: StreamServer, take: Callable[[Frame], object]) -> None:
+    def __init__(self, server: StreamServer, receive: Callable[[Frame], object]) -> None:
         super().__init__(server)
         self.wants = frozenset({*stream_server.LATEST, *stream_server.ONCE, *stream_server.RAW})
-        self._take = take
+        self._receive = receive
         server.clients.add(self)
 
     def tell(self, topic: str, body: bytes) -> None:
-        """Take it at once."""
-        self._take(messages.read(topic, body))
+        """Decode and deliver a message at once."""
+        self._receive(messages.read(topic, body))
 
 
-class Retold:
-    """A log that is played through the daemon's own cycle.
+class RecordingSource:
+    """Stream messages of a log that is replayed through the daemon's own cycle.
 
     Attributes:
         source, config, rerun: as `daemon.cli.replay` has them.
 
     Raises:
-        HalError: the log, or what it was made with, cannot be used.
+        HalError: the log, its configuration or its survey cannot be used.
     """
 
     def __init__(self, path: Path, config: Config, given: Given = NOTHING_GIVEN) -> None:
@@ -53,16 +53,16 @@ class Retold:
         lights = lights_for(self.source, self.config, given)
         start = start_for(self.source, self.config, lights, given)
         self.rerun = Rerun(self.source, self.config, lights, None, start)
-        self._heard: list[Frame] = []
+        self._received: list[Frame] = []
         self._server = StreamServer(Path(), self.config.name, lambda reason: REASONS[Reason(reason)])
-        Listener(self._server, self._heard.append)
+        InProcessClient(self._server, self._received.append)
         self.rerun.watch = lambda record: self._server.publish(record.snapshot)
 
     def frames(self, raw: bool = True) -> Iterator[Frame]:
-        """Everything in order, up to the end; ``raw``: also the bytes between daemon and devices.
+        """All messages in order; ``raw``: including the bytes between daemon and devices.
 
         Raises:
-            HalError: the log cannot be read on.
+            HalError: the rest of the log cannot be read.
         """
         passed = self._raw() if raw and self.source.recorded else iter(())
         waiting, beat_at = next(passed, None), -1.0
@@ -78,15 +78,15 @@ class Retold:
             while waiting is not None and waiting.t_mono <= self.rerun.t_mono:
                 yield waiting
                 waiting = next(passed, None)
-            yield from self._heard
-            self._heard.clear()
-        while waiting is not None:  # after the last scan: often why there was none
+            yield from self._received
+            self._received.clear()
+        while waiting is not None:  # after the last scan: often the cause of its absence
             yield waiting
             waiting = next(passed, None)
         self.rerun.finish()
 
     def _raw(self) -> Iterator[Raw]:
-        """What passed through the lidar's port, from where the replay begins."""
+        """The bytes at the lidar's port, from the beginning of the replay."""
         since = -1.0 if self.source.begin is None else self.source.begin.t_mono
         for frame in open_recording(self.source.path).frames(LogReport()):
             if frame.kind in PASSED and frame.channel == 0 and frame.t_mono >= since:

@@ -1,4 +1,4 @@
-"""The map as the stream tells it, tile by tile, put together again."""
+"""Assembles the map from the tiles of the stream."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy.typing as npt
 
 from daemon.maps import map_server
 from daemon.maps.tiles import RESOLUTION_M
-from taps.stream.messages import MapTiles
+from daemon.publish.stream.messages import MapTiles
 
 LogOdds = npt.NDArray[np.float32]
-NOTHING: Final = np.zeros((1, 1), np.float32)
-"""One cell, not known: after RESET the map that was must not stand, and none at all is more than some can read."""
+EMPTY_MAP: Final = np.zeros((1, 1), np.float32)
+"""One unknown cell: replaces the map after RESET, since some readers cannot handle an empty grid."""
 WALL, FREE, UNSEEN = 100, 0, -1
-"""Cells of a map as others have it: ROS's OccupancyGrid."""
+"""Cell values of ROS's OccupancyGrid."""
 
 
-class Tiles:
-    """What the map shows.
+class TileMap:
+    """The tiles of one map.
 
     Attributes:
         resolution: m per cell. map_id: of the map.
@@ -32,15 +32,15 @@ class Tiles:
         self._tiles: dict[tuple[int, int], LogOdds] = {}
 
     @property
-    def fresh(self) -> bool:
-        """Whether it is to be drawn anew; also where nothing is left of it."""
+    def changed(self) -> bool:
+        """Whether the map has changed since :meth:`whole`, also to an empty one."""
         return self._changed
 
-    def take(self, frame: MapTiles) -> None:
-        """Some tiles, as log-odds.
+    def update(self, frame: MapTiles) -> None:
+        """Replace some tiles.
 
         Raises:
-            NotTheStream: they cannot be read.
+            NotTheStream: they cannot be decoded.
         """
         for column, row, packed in frame.tiles:
             cells = frame.cells(packed)
@@ -51,10 +51,10 @@ class Tiles:
         self.resolution, self.map_id, self._changed = frame.resolution, frame.map_id, not frame.more
 
     def whole(self) -> tuple[tuple[float, float], LogOdds]:
-        """Lower left corner (m) and log-odds (rows, columns), rows from below, 0 not known; one cell of nothing."""
+        """Lower left corner (m) and log-odds (rows, columns), rows from below, 0 unknown; an empty map is one cell."""
         self._changed = False
         if not self._tiles:
-            return (0.0, 0.0), NOTHING
+            return (0.0, 0.0), EMPTY_MAP
         columns, rows = zip(*self._tiles, strict=True)
         left, below, side = min(columns), min(rows), len(next(iter(self._tiles.values())))
         whole = np.zeros(((max(rows) - below + 1) * side, (max(columns) - left + 1) * side), np.float32)

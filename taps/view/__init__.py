@@ -1,1 +1,1 @@
-"""The web page: a process of its own that shows the local stream, or a recording, to browsers."""
+"""The web page: serves the local stream, or a recording, to browsers."""

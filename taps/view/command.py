@@ -1,4 +1,4 @@
-"""`lumiloop view`: the web page of a running daemon, or of a recording."""
+"""`lumiloop view`: serves the web page of a running daemon, or of a recording."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ from typing import Final
 
 from aiohttp import web
 
-from daemon.cli import parser
-from daemon.cli.status import NoAnswer, address_of
+from daemon.cli.status import address_of
 from daemon.config import loader
 from daemon.config.endpoints import in_url
 from daemon.config.schema import Config
-from daemon.runtime.light_setup import SurveyError
+from daemon.config.survey_loader import SurveyError
+from daemon.publish.modbus.client import NoAnswer
+from daemon.publish.stream.client import Stream
+from daemon.system import console
 from daemon.system.logging import to_journal
-from hal.run_server import stopping
-from taps.stream.client import Stream
-from taps.view.access_guard import Guard, TokenRefused, token_for
-from taps.view.page_hello import CannotLook, Scene, scene_of
-from taps.view.replay_file import Film
+from hal.run_server import stop_event
+from taps.access_guard import Guard, TokenRefused, token_for
+from taps.view.page_hello import Scene, SceneUnreadable, scene_of
+from taps.view.replay_file import ReplayFile
 from taps.view.server import TOPICS, View
 
 PORT: Final = 8090
 NICENESS: Final = 5
-"""A page is never worth a late pose."""
+"""Niceness of the process: the page must not delay a pose."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -49,11 +50,11 @@ def main(args: argparse.Namespace) -> int:
             raise CannotServe("nobody could read a fresh token but in the log: name a file with one, --token FILE")
         return _show(args, Guard(args.bind, token, args.write))
     except (TokenRefused, SurveyError, NoAnswer, CannotServe) as error:
-        return parser.fail(str(error))
+        return console.fail(str(error))
 
 
 class CannotServe(Exception):
-    """The page cannot be served; the text says why and what to do."""
+    """The page cannot be served; the text gives the cause and a remedy."""
 
 
 def _show(args: argparse.Namespace, guard: Guard) -> int:
@@ -66,28 +67,28 @@ def _show(args: argparse.Namespace, guard: Guard) -> int:
         )
         return _serve(view, guard, args.port, f"lumiloop {settings.name}")
     if args.write:
-        return parser.fail("a recording takes no orders: leave --write out", parser.USAGE)
+        return console.fail("a recording takes no orders: leave --write out", console.USAGE)
     if not args.log.exists():
-        return parser.fail(f"{args.log}: there is no such recording")
+        return console.fail(f"{args.log}: there is no such recording")
     with _film(args) as film:
         return _serve(View(guard, Scene(settings.name), film=film), guard, args.port, f"recording {args.log}")
 
 
 def _scene(file: Path | None, words: tuple[str, ...]) -> Scene:
-    """As configuration and survey are by now.
+    """The scene of the present configuration and survey.
 
     Raises:
-        CannotLook: one of them cannot be read.
+        SceneUnreadable: one of them cannot be read.
     """
     try:
         return scene_of(loader.load(file, list(words)))
     except (loader.ConfigError, SurveyError) as error:
-        raise CannotLook(str(error)) from None
+        raise SceneUnreadable(str(error)) from None
 
 
 @contextlib.contextmanager
-def _film(args: argparse.Namespace) -> Iterator[Film]:
-    """A film of the recording, which another process goes on making.
+def _film(args: argparse.Namespace) -> Iterator[ReplayFile]:
+    """The replay file of the recording, which another process writes meanwhile.
 
     Raises:
         CannotServe: the recording cannot be read.
@@ -98,10 +99,10 @@ def _film(args: argparse.Namespace) -> Iterator[Film]:
         file.touch()
         given = args.config is not None, keys
         maker = multiprocessing.get_context("spawn").Process(
-            target=_shoot, args=(args.log, args.settings, given, file), name="film", daemon=True
+            target=_record, args=(args.log, args.settings, given, file), name="film", daemon=True
         )
         maker.start()
-        film = Film(args.log, file, maker.is_alive)
+        film = ReplayFile(args.log, file, maker.is_alive)
         try:
             _wait(film)
             yield film
@@ -111,33 +112,33 @@ def _film(args: argparse.Namespace) -> Iterator[Film]:
             film.close()
 
 
-def _shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
-    """The other process: it alone loads the estimator, which may have to be compiled."""
+def _record(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
+    """The writing process: only it loads the estimator, which may have to be compiled."""
     from daemon.runtime import warmup
 
     try:
-        warmup.load_aloud(parser.say, "warm", warmup.load, "taps.view.replay_recorder")
+        warmup.load_aloud(console.say, "warm", warmup.load, "taps.view.replay_recorder")
     except warmup.CannotLoad as error:
-        parser.fail(str(error))
+        console.fail(str(error))
         return
     try:
-        import_module("taps.view.replay_recorder").shoot(log, settings, given, out)
+        import_module("taps.view.replay_recorder").record(log, settings, given, out)
     except OSError as error:
-        parser.fail(f"{out}: {error.strerror}; the recording is shown as far as it was replayed")
+        console.fail(f"{out}: {error.strerror}; the recording is shown as far as it was replayed")
 
 
-def _wait(film: Film) -> None:
-    """Until the recording is known to be one."""
-    parser.say("replaying the recording; it can be watched meanwhile")
+def _wait(film: ReplayFile) -> None:
+    """Wait until the recording has proved readable."""
+    console.say("replaying the recording; it can be watch_router meanwhile")
     while film.scene is None and not film.done:
         time.sleep(0.05)
-        film.look()
+        film.refresh()
     if film.error:
         raise CannotServe(film.error)
 
 
 def _serve(view: View, guard: Guard, port: int, what: str) -> int:
-    """Serve until somebody stops it."""
+    """Serve until interrupted."""
     logging.basicConfig(level=logging.WARNING, format="lumiloop: %(message)s")
     try:
         asyncio.run(_until_signal(view, guard, port, what))
@@ -145,31 +146,31 @@ def _serve(view: View, guard: Guard, port: int, what: str) -> int:
         taken = error.errno == errno.EADDRINUSE
         remedy = "name another with --port" if taken else "name an address of this computer with --bind"
         raise CannotServe(f"{guard.bind} port {port}: {error.strerror or error}; {remedy}") from None
-    return parser.OK
+    return console.OK
 
 
 async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
-    stop = stopping()
+    stop = stop_event()
     runner = web.AppRunner(view.app(), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     try:
         site = web.TCPSite(runner, guard.bind, port)
         await site.start()
-        parser.say(f"{what}: {address(guard, _port_of(runner), whole=not to_journal())}")
+        console.say(f"{what}: {address(guard, _port_of(runner), whole=not to_journal())}")
         await stop.wait()
     finally:
         await runner.cleanup()
 
 
 def _port_of(runner: web.AppRunner) -> int:
-    """The port that was taken, where any was asked for."""
+    """The actual port, where port 0 was requested."""
     return int(runner.addresses[0][1])
 
 
 def address(guard: Guard, port: int, whole: bool = True) -> str:
-    """What a person opens; the token stands behind the #, which browsers tell no server.
+    """The URL for a person; the token is in the fragment, which browsers do not send to servers.
 
-    Not ``whole``: it goes to a log, which others read, and says that there is a token.
+    Not ``whole``: for a log, with the token replaced by dots.
     """
     host = guard.bind
     if host in ("0.0.0.0", "::", ""):

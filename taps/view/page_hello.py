@@ -1,4 +1,4 @@
-"""What a page is told first: who it watches, what numbers mean, what may be ordered, where lamps hang."""
+"""The first message to a page: name, meanings of numbers, permitted commands, positions of the lamps."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from pathlib import Path
 from typing import Any, Final
 
 from daemon.config.schema import Config
+from daemon.devices.light_setup import load_lights
 from daemon.publish import meanings
 from daemon.publish.modbus.timing_block import RUNGS
-from daemon.runtime.light_setup import load_lights
 from daemon.snapshot import Stage
-from estimator.light_filter.survey import Survey
+from estimator import Survey
 from taps.view.orders import NAMES
 
 PROTOCOL: Final = 1
-"""Of the messages between page and server; a page of another one loads itself anew."""
+"""Version of the messages between page and server; a page of another version reloads itself."""
 
 
-class CannotLook(Exception):
-    """Configuration or survey cannot be read; the text says why."""
+class SceneUnreadable(Exception):
+    """Configuration or survey cannot be read; the text gives the cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What the stream does not tell and a picture needs.
+    """Data of the picture that the stream does not carry.
 
     Attributes:
         name: of the robot. mount: x, y (m), yaw (deg), whether upside down. lamps: number, code, x, y each.
-        budget_ms: of a cycle, 0: half a scan period. alert_m: limit of the bound, 0: none.
+        budget_ms: of a cycle, 0: half a scan period. alert_m: alert limit, 0: none.
     """
 
     name: str
@@ -40,10 +40,10 @@ class Scene:
 
 
 def scene_of(settings: Config, survey: Survey | None = None) -> Scene:
-    """Of a configuration and the survey that it names.
+    """The scene of a configuration and its survey.
 
     Raises:
-        SurveyError: that cannot be read.
+        SurveyError: the survey cannot be read.
     """
     if survey is None and settings.photodiode.fitted and settings.lights.survey:
         lights = load_lights(settings)
@@ -80,5 +80,5 @@ def welcome(scene: Scene, page: str, order: bool, recording: Path | None) -> dic
 
 
 def _table(words: Mapping[Any, str]) -> dict[str, list[str]]:
-    """Name and meaning by number, of a table by members of an enumeration."""
+    """Name and meaning by number, from a table by members of an enumeration."""
     return {str(int(key)): [key.name, text] for key, text in words.items()}

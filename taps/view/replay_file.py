@@ -1,6 +1,6 @@
-"""A film of a recording, as `taps.view.replay_recorder` writes it: pieces of what the stream would tell, by time.
+"""The replay file of a recording: the stream's messages by time, as `taps.view.replay_recorder` writes them.
 
-It can be read while it grows. Only where each piece lies is kept in memory.
+It can be read while it grows. Only the offsets of the messages are kept in memory.
 """
 
 from __future__ import annotations
@@ -20,44 +20,44 @@ from taps.view.viewers import Tile
 
 KINDS: Final = ("pose", "lights", "scan", "statistics", "loop", "state", "faults", "row", "map", "scene", "end")
 HEAD: Final = struct.Struct("<dBI")
-"""Before each piece: its time, its kind, its length."""
+"""Head of each message: time, kind, length."""
 DIED: Final = "the replay has died before its end (no memory, or no room in the folder of temporary files?)"
 
 _tile: Final = msgspec.msgpack.Decoder(tuple[int, int, bytes, dict[str, float]]).decode
 
 
 @dataclass(slots=True)
-class Reel:
-    """The pieces of one kind: when, and where in the file."""
+class Track:
+    """Times and file offsets of the messages of one kind."""
 
     times: array[float] = field(default_factory=lambda: array("d"))
     offsets: array[int] = field(default_factory=lambda: array("q"))
     lengths: array[int] = field(default_factory=lambda: array("l"))
 
     def upto(self, t: float) -> int:
-        """How many there are until an instant."""
+        """Number of messages up to a time."""
         return bisect_right(self.times, t)
 
 
-class Film:
-    """A film that is being made, read from its file.
+class ReplayFile:
+    """Reader of a replay file that another process may still be writing.
 
     Attributes:
-        source: the recording. reels: by kind. tiles: of the map, a reel each. about: of the map's tiles.
-        t_first, t_last: instants that can be shown; equal before there are any. done: it is whole.
-        error: why it has ended before the recording did, empty otherwise.
-        scene: what a page is told of the robot that was recorded, None until it is known.
+        source: the recording. tracks: by kind. tiles: of the map, a track each. about: common data of the tiles.
+        t_first, t_last: first and last time that can be shown; equal before there are any. done: the file is complete.
+        error: why it ended before the recording, empty otherwise.
+        scene: of the recorded robot, for the page; None until known.
 
     Args:
-        source: the recording. file: the film's. making: whether somebody is at it still; a maker that has died, for
-            lack of memory or room on the disk perhaps, has not written how it ended.
+        source: the recording. file: the replay file. making: returns whether the writer is alive; a writer that died,
+            for lack of memory or disk space perhaps, leaves no end message.
     """
 
     def __init__(self, source: Path, file: Path, making: Callable[[], bool] = lambda: True) -> None:
         self.source = source
         self._making = making
-        self.reels: dict[str, Reel] = {kind: Reel() for kind in KINDS}
-        self.tiles: dict[Tile, Reel] = {}
+        self.tracks: dict[str, Track] = {kind: Track() for kind in KINDS}
+        self.tiles: dict[Tile, Track] = {}
         self.about: dict[str, object] = {}
         self.t_first = self.t_last = 0.0
         self.done, self.error = False, ""
@@ -69,14 +69,14 @@ class Film:
         """Close the file."""
         os.close(self._file)
 
-    def look(self) -> None:
-        """Take in what has been added since."""
-        making = self._making()  # asked before: what it wrote last is there by then
-        self._take_in()
+    def refresh(self) -> None:
+        """Index the messages added since the last call."""
+        making = self._making()  # checked first: its last messages are then in the file
+        self._index()
         if not making and not self.done:
             self.done, self.error = True, DIED
 
-    def _take_in(self) -> None:
+    def _index(self) -> None:
         while not self.done:
             head = os.pread(self._file, HEAD.size, self._read)
             if len(head) < HEAD.size:
@@ -88,13 +88,13 @@ class Film:
             self._read = at + length
             self._add(KINDS[number], t, at, length)
 
-    def piece(self, reel: Reel, index: int) -> bytes:
-        """One piece's bytes."""
-        return os.pread(self._file, reel.lengths[index], reel.offsets[index])
+    def piece(self, track: Track, index: int) -> bytes:
+        """The bytes of one message."""
+        return os.pread(self._file, track.lengths[index], track.offsets[index])
 
-    def tile(self, reel: Reel, index: int) -> bytes:
+    def tile(self, track: Track, index: int) -> bytes:
         """One tile's cells, deflated."""
-        return _tile(self.piece(reel, index))[2]
+        return _tile(self.piece(track, index))[2]
 
     def _add(self, kind: str, t: float, at: int, length: int) -> None:
         if kind == "end":
@@ -103,14 +103,14 @@ class Film:
         if kind == "scene":
             self.scene = msgspec.msgpack.decode(os.pread(self._file, length, at))
             return
-        reel = self.reels[kind]
+        track = self.tracks[kind]
         if kind == "map":
             column, row, _, about = _tile(os.pread(self._file, length, at))
             self.about = dict(about)
-            reel = self.tiles.setdefault((column, row), Reel())
-        reel.times.append(t)
-        reel.offsets.append(at)
-        reel.lengths.append(length)
+            track = self.tiles.setdefault((column, row), Track())
+        track.times.append(t)
+        track.offsets.append(at)
+        track.lengths.append(length)
         if kind == "pose":
             self.t_first = self.t_first or t
             self.t_last = t

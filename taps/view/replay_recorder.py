@@ -1,7 +1,6 @@
-"""Makes a film of a recording: the daemon's own pipeline runs over it once, and what the stream would tell is kept.
+"""Writes the replay file of a recording: one run of the daemon's pipeline, with the stream's messages stored by time.
 
-In a process of its own, at low priority; it is faster than the recording was. The film is thinned to what an eye can
-tell apart.
+It runs in a process of its own at low priority, faster than real time. Messages are thinned to a visible rate.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ from typing import BinaryIO, Final
 
 import msgspec
 
-from daemon.cli.replay import Given, config_for, lights_for, start_for
 from daemon.config.schema import Config
+from daemon.config.survey_loader import SurveyError
 from daemon.health.reasons import REASONS, Reason
 from daemon.maps.tiles import MapTiles
-from daemon.publish.stream_server import Client, StreamServer
-from daemon.publish.stream_ticker import in_words, place_of
+from daemon.publish.stream import messages
+from daemon.publish.stream.server import Client, StreamServer
+from daemon.publish.stream.ticker import in_words, place_of
+from daemon.replay.recorded_inputs import Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
 from daemon.replay.sources import open_log
 from daemon.runtime import warmup
-from daemon.runtime.light_setup import SurveyError
 from hal.errors import HalError
 from hal.lidar import RawScan
-from taps.stream import messages
 from taps.view.page_hello import scene_of
 from taps.view.replay_file import HEAD, KINDS
 from taps.view.viewers import History, about_of, encode, frame
@@ -37,9 +36,9 @@ from taps.view.viewers import History, about_of, encode, frame
 TOPICS: Final = frozenset({"pose", "lights", "scan", "state", "loop", "faults", "map"})
 THINNED: Final = ("pose", "lights", "scan")
 STEP_S: Final = 0.05
-"""Between two poses of a film."""
+"""Least interval of stored poses."""
 BEAT_S: Final = 1.0
-"""Of the recording's time, between two looks at the map, and at what is wrong."""
+"""Interval of map and fault updates, in the recording's time."""
 DRAWN_S: Final = 20.0
 
 _pose: Final = msgspec.msgpack.Decoder(messages.Pose).decode
@@ -47,8 +46,8 @@ _lights: Final = msgspec.msgpack.Decoder(messages.Lights).decode
 _map: Final = msgspec.msgpack.Decoder(messages.MapTiles).decode
 
 
-class Camera(Client):
-    """A client of a stream that nobody serves: what it is told is written to the film."""
+class ReplayRecorder(Client):
+    """A client of the stream server in this process, which writes the messages to the replay file."""
 
     def __init__(self, server: StreamServer, out: BinaryIO) -> None:
         super().__init__(server)
@@ -60,7 +59,7 @@ class Camera(Client):
         self._history, self._used = History(), 0
 
     def tell(self, topic: str, body: bytes) -> None:
-        """Keep it, if it is worth it."""
+        """Write a message, unless it is thinned out."""
         if topic == "map":
             self._keep_tiles(_map(body))
             return
@@ -68,29 +67,29 @@ class Camera(Client):
             if self.t_mono - self._last.get(topic, -1e9) < STEP_S - 1e-3:
                 return
             self._last[topic] = self.t_mono
-        if topic == "pose" and (row := self._history.take(_pose(body), self._used)) is not None:
+        if topic == "pose" and (row := self._history.add(_pose(body), self._used)) is not None:
             self._write("row", frame("row", row))
         elif topic == "lights":
             self._used = _lights(body).used
         self._write(topic, frame(topic, msgspec.Raw(body)))
 
-    def scene(self, told: dict[str, object]) -> None:
-        """What the robot was like."""
-        self._write("scene", encode(told))
+    def scene(self, scene: dict[str, object]) -> None:
+        """Write the scene of the recorded robot."""
+        self._write("scene", encode(scene))
         self._out.flush()
 
     def end(self, error: str) -> None:
-        """There is no more."""
+        """Write the end message."""
         self._write("end", error.encode())
         self._out.flush()
 
     def flush(self) -> None:
-        """Let it be read."""
+        """Make the written messages visible to readers."""
         self._out.flush()
 
-    def _keep_tiles(self, told: messages.MapTiles) -> None:
-        about = about_of(told)
-        for column, row, cells in told.tiles:
+    def _keep_tiles(self, scene: messages.MapTiles) -> None:
+        about = about_of(scene)
+        for column, row, cells in scene.tiles:
             self._write("map", encode([column, row, cells, about]))
 
     def _write(self, kind: str, body: bytes) -> None:
@@ -98,8 +97,8 @@ class Camera(Client):
         self._out.write(body)
 
 
-def shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
-    """Make the film, out of the way of others: the body of a process of its own."""
+def record(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
+    """Write the replay file at low priority: the body of a process."""
     with contextlib.suppress(OSError):
         os.nice(10)
     with contextlib.suppress(KeyboardInterrupt):
@@ -107,33 +106,35 @@ def shoot(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out:
 
 
 def make(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
-    """Make the film. ``given``: as of `daemon.cli.replay.Given`. What goes wrong with the recording is said at its end.
+    """Write the replay file. ``given``: see `daemon.replay.recorded_inputs.Given`.
+
+    An error of the recording is stored in the end message.
 
     Raises:
-        OSError: the film cannot be written; it lasts as far as it came.
+        OSError: the replay file cannot be written; it ends there.
     """
-    asyncio.run(_shoot(log, settings, Given(*given), out))
+    asyncio.run(_record(log, settings, Given(*given), out))
 
 
-async def _shoot(log: Path, settings: Config, given: Given, out: Path) -> None:
+async def _record(log: Path, settings: Config, given: Given, out: Path) -> None:
     with out.open("wb") as file:
         server = StreamServer(out, settings.name, lambda reason: REASONS[Reason(reason)])
-        camera = Camera(server, file)
-        server.clients.add(camera)
+        recorder = ReplayRecorder(server, file)
+        server.clients.add(recorder)
         error = ""
         try:
-            await _run(log, settings, given, server, camera)
+            await _run(log, settings, given, server, recorder)
         except (HalError, SurveyError, warmup.CannotLoad, OSError, ValueError) as problem:
             error = str(problem) or type(problem).__name__
         finally:
-            camera.end(error)
+            recorder.end(error)
 
 
-async def _run(log: Path, settings: Config, given: Given, server: StreamServer, camera: Camera) -> None:
+async def _run(log: Path, settings: Config, given: Given, server: StreamServer, recorder: ReplayRecorder) -> None:
     source = open_log(log)
     used = config_for(source, settings, given)
     lights = lights_for(source, used, given)
-    camera.scene(asdict(scene_of(used, None if lights is None else lights.survey)))
+    recorder.scene(asdict(scene_of(used, None if lights is None else lights.survey)))
     warmup.load(lights)
     rerun = Rerun(source, used, lights, None, start_for(source, used, lights, given))
     rerun.cycle.parts.sinks.append(server.publish)
@@ -141,22 +142,22 @@ async def _run(log: Path, settings: Config, given: Given, server: StreamServer, 
     server.tiles = tiles = MapTiles(lambda: rerun.state, server.on_tiles)
     beat_at = -1.0
     for event in source.events():
-        camera.t_mono = max(camera.t_mono, rerun.t_mono)
+        recorder.t_mono = max(recorder.t_mono, rerun.t_mono)
         if isinstance(event, RawScan):
             server.on_scan(event)
         rerun.feed(event)
         if rerun.t_mono >= beat_at:
-            camera.t_mono, beat_at = rerun.t_mono, rerun.t_mono + BEAT_S
+            recorder.t_mono, beat_at = rerun.t_mono, rerun.t_mono + BEAT_S
             server.on_faults(rerun.t_mono, in_words(rerun.faults))
             await _draw(tiles)
-            camera.flush()
+            recorder.flush()
     await _draw(tiles)
     tiles.close()
 
 
 async def _draw(tiles: MapTiles) -> None:
-    """Have the map drawn as it is now, and wait for it."""
+    """Render the present map and wait for it."""
     tiles.follow(asyncio.get_running_loop())
     end = time.monotonic() + DRAWN_S
-    while tiles.busy and time.monotonic() < end:  # noqa: ASYNC110  tiles that are the same tell nobody
+    while tiles.busy and time.monotonic() < end:  # noqa: ASYNC110  unchanged tiles cause no callback
         await asyncio.sleep(0.002)

@@ -1,4 +1,4 @@
-"""The web server: pages and WebSockets. It takes the stream as one client, however many browsers watch."""
+"""The web server: pages and WebSockets. It is a single client of the stream, for any number of browsers."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from typing import Any, Final
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from taps.stream.client import Lost, Stream
-from taps.stream.messages import Hello, NotTheStream, Refused
-from taps.view.access_guard import HEADERS, Guard
-from taps.view.orders import OrderRefused, Orders
-from taps.view.page_hello import CannotLook, Scene, welcome
-from taps.view.replay_file import Film
-from taps.view.replay_player import Player
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import Hello, NotTheStream, Refused
+from taps.access_guard import HEADERS, Guard
+from taps.command_client import CommandRefused
+from taps.view.orders import Orders
+from taps.view.page_hello import Scene, SceneUnreadable, welcome
+from taps.view.replay_file import ReplayFile
+from taps.view.replay_player import ReplayPlayer
 from taps.view.viewers import Hub, Viewer, frame
 
 log = logging.getLogger(__name__)
@@ -39,23 +40,23 @@ SUFFIXES: Final = {
     ".webmanifest": "application/manifest+json",
 }
 VIEWERS: Final = 32
-STRANGERS: Final = 16
-"""Who have not yet said who they are; where more come, the first of them goes. They take no viewer's place."""
+UNAUTHENTICATED: Final = 16
+"""Most connections before authentication; a further one replaces the oldest. They do not count as viewers."""
 FULL: Final = f"{VIEWERS} browsers are watching; close one."
 PACE_S: Final = 0.04
 """Least time between two messages to a browser."""
 KEPT_BYTES: Final = 64 << 10
-"""On their way to one browser."""
+"""Bytes buffered for one browser."""
 HELLO_S: Final = 10.0
-"""For the page's first words."""
+"""Time limit of the page's first message."""
 WRONG_TOKEN_S: Final = 0.5
-"""What a wrong token costs; and no more than `GUESSES` at a time."""
+"""Delay after a wrong token; at most `GUESSES` are checked at a time."""
 GUESSES: Final = 4
-LONGEST_WORDS: Final = 4096
+LONGEST_MESSAGE: Final = 4096
 HEARTBEAT_S: Final = 10.0
 TRY_AGAIN_S: Final = 5.0
 MARK: Final = b"@PAGE@"
-"""Stands in the page where the number of its version goes."""
+"""Placeholder in the page for its version."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -64,9 +65,9 @@ class View:
     """One web server.
 
     Args:
-        guard: who may look, and who may order. scene: what the stream does not tell.
-        stream: of the daemon; None where a ``film`` is shown. modbus: host and port for orders.
-        again: reads the scene anew, for each daemon that begins; raises `CannotLook`.
+        guard: access control. scene: data that the stream does not carry.
+        stream: of the daemon; None where a ``film`` is shown. modbus: host and port for commands.
+        again: reloads the scene, for each started daemon; raises `SceneUnreadable`.
     """
 
     def __init__(
@@ -74,31 +75,31 @@ class View:
         guard: Guard,
         scene: Scene,
         stream: Stream | None = None,
-        film: Film | None = None,
+        film: ReplayFile | None = None,
         modbus: tuple[str, int] = ("127.0.0.1", 0),
         again: Callable[[], Scene] | None = None,
     ) -> None:
         self.hub = Hub()
         self.page, self._files = pages()
         self._guard, self._scene, self._stream, self._film, self._again = guard, scene, stream, film, again
-        self._orders = Orders(*modbus, tell=lambda told: self.hub.tell("order", told), stream=stream)
+        self._orders = Orders(*modbus, notify=lambda order: self.hub.broadcast("order", order), stream=stream)
         self._count = 0
         self._guesses = asyncio.Semaphore(GUESSES)
         self._sockets: set[web.WebSocketResponse] = set()
-        self._strangers: deque[web.WebSocketResponse] = deque()
+        self._unauthenticated: deque[web.WebSocketResponse] = deque()
 
     def app(self) -> web.Application:
-        """What aiohttp serves."""
+        """The aiohttp application."""
         app = web.Application(middlewares=[self._guarded])
         app.router.add_get("/ws", self._socket)
         app.router.add_get("/{name:[a-z0-9.-]*}", self._file)
         app.cleanup_ctx.append(self._following)
-        app.on_shutdown.append(self._part)
+        app.on_shutdown.append(self._close_all)
         return app
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Host, then what is asked for; every answer carries the headers."""
+        """Check the Host header, handle the request, and add the security headers."""
         if not self._guard.host_ok(request.headers.get("Host", "")):
             text = "This page is not called by that name. Use the address that `lumiloop view` printed.\n"
             return web.Response(status=421, text=text, headers=HEADERS)
@@ -124,34 +125,34 @@ class View:
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         if not self._guard.origin_ok(request.headers.get("Origin"), request.headers.get("Host", "")):
             raise web.HTTPForbidden(text="Only the page of this server may open this.\n")
-        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LONGEST_WORDS, compress=False)
+        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LONGEST_MESSAGE, compress=False)
         await socket.prepare(request)
-        _little_kept(request)
+        _limit_buffers(request)
         try:
-            if (viewer := await self._greeted(socket)) is not None:
+            if (viewer := await self._admit(socket)) is not None:
                 await self._serve(socket, viewer)
         except ConnectionResetError:
-            pass  # the page was closed while something was being sent to it
+            pass  # the page was closed during a transmission
         finally:
             self._sockets.discard(socket)
         return socket
 
-    async def _greeted(self, socket: web.WebSocketResponse) -> Viewer | None:
-        """A viewer, which has a place now; None: it was refused, and told why."""
-        if len(self._strangers) >= STRANGERS:
-            await _refuse(self._strangers.popleft(), "words", "Others came before it said who it is.")
-        self._strangers.append(socket)
+    async def _admit(self, socket: web.WebSocketResponse) -> Viewer | None:
+        """Admit a connection as a viewer; None: it was refused, with a reason."""
+        if len(self._unauthenticated) >= UNAUTHENTICATED:
+            await _refuse(self._unauthenticated.popleft(), "words", "Others came before it said who it is.")
+        self._unauthenticated.append(socket)
         try:
-            return await self._known(socket)
+            return await self._authenticate(socket)
         finally:
-            with contextlib.suppress(ValueError):  # it has gone for others
-                self._strangers.remove(socket)
+            with contextlib.suppress(ValueError):  # it was replaced by another one
+                self._unauthenticated.remove(socket)
 
-    async def _known(self, socket: web.WebSocketResponse) -> Viewer | None:
-        """A viewer, after its first words."""
-        words = await _words(socket, HELLO_S)
-        token = None if words is None else words.get("token")
-        if words is None:
+    async def _authenticate(self, socket: web.WebSocketResponse) -> Viewer | None:
+        """Authenticate a connection by its first message."""
+        message = await _receive_json(socket, HELLO_S)
+        token = None if message is None else message.get("token")
+        if message is None:
             await _refuse(socket, "words", "A page says first who it is.")
             return None
         if token is not None and not self._guard.token_ok(token):
@@ -167,43 +168,45 @@ class View:
         self._count += 1
         viewer = Viewer(self._count, self._guard.may_order(token) and self._film is None)
         recording = None if self._film is None else self._film.source
-        told = welcome(self._scene, self.page, viewer.order, recording)
-        told |= {"you": viewer.number, "wrong_token": token is not None and not self._guard.token_ok(token)}
-        await socket.send_json({"kind": "welcome", **told})
+        item = welcome(self._scene, self.page, viewer.order, recording)
+        item |= {"you": viewer.number, "wrong_token": token is not None and not self._guard.token_ok(token)}
+        await socket.send_json({"kind": "welcome", **item})
         return viewer
 
     async def _serve(self, socket: web.WebSocketResponse, viewer: Viewer) -> None:
-        player = None if self._film is None else Player(self._film, viewer)
+        player = None if self._film is None else ReplayPlayer(self._film, viewer)
         if player is None:
             self.hub.welcome(viewer)
-        tasks = [asyncio.create_task(_or_part(socket, _send(socket, viewer)))]
+        tasks = [asyncio.create_task(_close_on_error(socket, _send(socket, viewer)))]
         if player is not None:
-            tasks.append(asyncio.create_task(_or_part(socket, player.run())))
+            tasks.append(asyncio.create_task(_close_on_error(socket, player.run())))
         try:
-            while (words := await _words(socket)) is not None:
-                if player is not None and "play" in words:
-                    player.told(words["play"])
-                elif "ping" in words:
-                    await socket.send_json({"kind": "pong", "ping": words["ping"], "utc": time.time()})
-                elif "order" in words:
-                    await self._order(viewer, words)
+            while (message := await _receive_json(socket)) is not None:
+                if player is not None and "play" in message:
+                    player.control(message["play"])
+                elif "ping" in message:
+                    await socket.send_json({"kind": "pong", "ping": message["ping"], "utc": time.time()})
+                elif "order" in message:
+                    await self._order(viewer, message)
         finally:
             self.hub.viewers.discard(viewer)
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _order(self, viewer: Viewer, words: dict[str, Any]) -> None:
+    async def _order(self, viewer: Viewer, message: dict[str, Any]) -> None:
         try:
             if not viewer.order:
-                raise OrderRefused("this page may only look: start `lumiloop view --write` and use the address it says")
-            await self._orders.give(viewer.number, words)
-        except OrderRefused as error:
-            told = {"order": str(words.get("order"))[:40], "viewer": viewer.number, "outcome": str(error)}
-            viewer.put("order", frame("order", told), once=True)
+                raise CommandRefused(
+                    "this page may only look: start `lumiloop view --write` and use the address it says"
+                )
+            await self._orders.give(viewer.number, message)
+        except CommandRefused as error:
+            item = {"order": str(message.get("order"))[:40], "viewer": viewer.number, "outcome": str(error)}
+            viewer.put("order", frame("order", item), once=True)
 
     async def _following(self, app: web.Application) -> AsyncIterator[None]:
-        """Follows the stream while the server runs."""
+        """Read the stream while the server runs."""
         following = None if self._stream is None else asyncio.create_task(self._follow(self._stream))
         yield
         await self._orders.close()
@@ -214,43 +217,43 @@ class View:
     async def _follow(self, stream: Stream) -> None:
         while True:
             try:
-                async for told in stream.frames():
-                    if isinstance(told, Hello):
-                        self.hub.met()
-                        self._look_again()
-                    elif isinstance(told, Lost):
-                        self.hub.lost(told.text)
-                        log.warning("%s", told.text)
-                    elif not isinstance(told, Refused):
-                        self.hub.take(told)
+                async for item in stream.frames():
+                    if isinstance(item, Hello):
+                        self.hub.connected()
+                        self._reload_scene()
+                    elif isinstance(item, Lost):
+                        self.hub.disconnected(item.text)
+                        log.warning("%s", item.text)
+                    elif not isinstance(item, Refused):
+                        self.hub.distribute(item)
             except NotTheStream as error:
-                self.hub.lost(str(error))
+                self.hub.disconnected(str(error))
                 log.error("%s", error)
-            except Exception:  # a defect of ours: the page says so and goes on, with all that comes after it
-                self.hub.lost("what the daemon told could not be shown; the log of `lumiloop view` says why")
-                log.exception("what the daemon told could not be shown")
+            except Exception:  # an internal error: the page shows it and continues
+                self.hub.disconnected("what the daemon item could not be shown; the log of `lumiloop view` says why")
+                log.exception("what the daemon item could not be shown")
             await asyncio.sleep(TRY_AGAIN_S)
 
-    def _look_again(self) -> None:
-        """A daemon has begun, perhaps with another survey or mount: pages draw what it has read."""
+    def _reload_scene(self) -> None:
+        """Reload the scene for a started daemon, whose survey or mount may have changed."""
         try:
             scene = self._scene if self._again is None else self._again()
-        except CannotLook as error:
+        except SceneUnreadable as error:
             log.warning("lamps and mount are shown as they were before: %s", error)
             return
         if scene != self._scene:
             self._scene = scene
-            self.hub.tell("scene", asdict(scene))
+            self.hub.broadcast("scene", asdict(scene))
 
-    async def _part(self, app: web.Application) -> None:
-        """The server stops: pages are told, and look whether another one comes."""
-        for socket in [*self._sockets, *self._strangers]:
+    async def _close_all(self, app: web.Application) -> None:
+        """Close all connections at the server's end; the pages then try to reconnect."""
+        for socket in [*self._sockets, *self._unauthenticated]:
             with contextlib.suppress(ConnectionError, RuntimeError):
                 await socket.close(code=WSCloseCode.GOING_AWAY, message=b"the view stops")
 
 
 def pages() -> tuple[str, dict[str, bytes]]:
-    """What is served: the number of this version of the page, and its files by name."""
+    """The version of the page (a hash), and its files by name."""
     folder = resources.files("taps.view").joinpath("page")
     files = {entry.name: entry.read_bytes() for entry in folder.iterdir() if Path(entry.name).suffix in SUFFIXES}
     digest = hashlib.sha256()
@@ -261,8 +264,8 @@ def pages() -> tuple[str, dict[str, bytes]]:
     return page, files
 
 
-def _little_kept(request: web.Request) -> None:
-    """What the kernel keeps for a browser that is slow is old when it arrives: let that be little."""
+def _limit_buffers(request: web.Request) -> None:
+    """Limit the send buffers, so that a slow browser receives recent data."""
     transport = request.transport
     if transport is not None:
         transport.set_write_buffer_limits(high=KEPT_BYTES)
@@ -271,30 +274,30 @@ def _little_kept(request: web.Request) -> None:
             sock.setsockopt(SOL_SOCKET, SO_SNDBUF, KEPT_BYTES)
 
 
-async def _or_part(socket: web.WebSocketResponse, work: Coroutine[Any, Any, None]) -> None:
-    """Work for a browser; where it fails the connection ends, and the page comes again by itself."""
+async def _close_on_error(socket: web.WebSocketResponse, work: Coroutine[Any, Any, None]) -> None:
+    """Run work for a browser; a failure closes the connection, and the page reconnects."""
     try:
         await work
     except ConnectionError:
         log.debug("a browser has gone", exc_info=True)
-    except Exception:  # a defect of ours
-        log.exception("a browser could not be told what it should see")
+    except Exception:  # an internal error
+        log.exception("a browser could not be item what it should see")
         with contextlib.suppress(ConnectionError, RuntimeError):
             await socket.close(code=WSCloseCode.INTERNAL_ERROR, message=b"the log of `lumiloop view` says why")
 
 
 async def _send(socket: web.WebSocketResponse, viewer: Viewer) -> None:
-    """Send what waits, as fast as the browser takes it, but not faster than it can be seen."""
+    """Send queued messages as fast as the browser accepts them, at most every :data:`PACE_S`."""
     while True:
-        await viewer.some.wait()
-        message = viewer.take()
+        await viewer.pending.wait()
+        message = viewer.next_message()
         if message is not None:
             await socket.send_bytes(message)
         await asyncio.sleep(PACE_S)
 
 
-async def _words(socket: web.WebSocketResponse, patience_s: float | None = None) -> dict[str, Any] | None:
-    """What the page says next; None: it has gone, or talks nonsense."""
+async def _receive_json(socket: web.WebSocketResponse, patience_s: float | None = None) -> dict[str, Any] | None:
+    """The page's next message; None: it has disconnected, or sent something invalid."""
     try:
         async with asyncio.timeout(patience_s):
             message = await socket.receive()
@@ -303,11 +306,11 @@ async def _words(socket: web.WebSocketResponse, patience_s: float | None = None)
     if message.type is not WSMsgType.TEXT:
         return None
     try:
-        words = json.loads(message.data, parse_int=float)  # beyond all floats: infinite, and no error later
-        json.dumps(words, ensure_ascii=False).encode()  # half a surrogate pair is no text
+        message = json.loads(message.data, parse_int=float)  # huge integers become infinite instead of an error later
+        json.dumps(message, ensure_ascii=False).encode()  # rejects lone surrogates
     except (ValueError, RecursionError):
         return None
-    return words if isinstance(words, dict) else None
+    return message if isinstance(message, dict) else None
 
 
 async def _refuse(socket: web.WebSocketResponse, what: str, text: str) -> None:

@@ -1,6 +1,6 @@
-"""What each browser still has to be told: the latest of its kind, all that happened once, tiles as they are by then.
+"""Message queues of the browsers: the latest message of each kind, all events, the present map tiles.
 
-Everything is encoded once, for all; a browser that does not keep up costs this process references to the latest.
+Every message is encoded once for all browsers; a slow browser costs references to the latest ones only.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from typing import Any, ClassVar, Final
 
 import msgspec
 
-from taps.stream.messages import TYPES, Data, Lights, MapTiles, Pose
+from daemon.publish.stream.messages import TYPES, Data, Lights, MapTiles, Pose
 
 KEPT: Final = 64
-"""Of what happens once."""
+"""Most queued events."""
 LOOPS: Final = 32
-"""Of the latest, that a newcomer is told."""
+"""Loop closures sent to a new viewer."""
 TILES_BYTES: Final = 64 << 10
-"""Of tiles in one message."""
+"""Bytes of tiles in one message, about."""
 ROWS: Final = 1200
 ROW_S: Final = 0.5
-"""Rows of history: ten minutes, two a second."""
+"""Interval of history rows: ten minutes, two per second."""
 
 Tile = tuple[int, int]
 ONCE: Final = ("loop", "state")
@@ -32,7 +32,7 @@ encode: Final = msgspec.msgpack.Encoder().encode
 
 
 def frame(topic: str, data: object) -> bytes:
-    """One frame as browsers read it."""
+    """Encode one frame for browsers."""
     return encode({"topic": topic, "data": data})
 
 
@@ -40,45 +40,45 @@ class Viewer:
     """One browser.
 
     Attributes:
-        number: counts viewers from 1. order: may give orders. replaced: frames that a newer one has replaced.
+        number: counts viewers from 1. order: may give commands. replaced: number of frames replaced by newer ones.
     """
 
     def __init__(self, number: int, order: bool = False) -> None:
         self.number, self.order = number, order
         self.replaced = 0
-        self.some = asyncio.Event()
+        self.pending = asyncio.Event()
         self._latest: dict[str, bytes] = {}
         self._once: deque[bytes] = deque(maxlen=KEPT)
         self._tiles: dict[Tile, bytes] = {}
         self._about: dict[str, object] = {}
 
     def put(self, topic: str, body: bytes, once: bool = False) -> None:
-        """Have it told."""
+        """Queue a frame; ``once``: an event, else it replaces the last of its topic."""
         if once:
             self.replaced += len(self._once) == KEPT
             self._once.append(body)
         else:
             self.replaced += topic in self._latest
             self._latest[topic] = body
-        self.some.set()
+        self.pending.set()
 
     def put_tiles(self, about: Mapping[str, object], tiles: Iterable[tuple[Tile, bytes]]) -> None:
-        """Have it told tiles, of a map that is described by ``about``; each replaces one that still waits."""
+        """Queue tiles of a map with the common data ``about``; each replaces a queued one at its place."""
         self._about = dict(about)
         self._tiles.update(tiles)
         if self._tiles:
-            self.some.set()
+            self.pending.set()
 
-    def forget(self) -> tuple[Tile, ...]:
-        """What still waits is of a world that has gone; returns the tiles that it has not been told."""
+    def clear(self) -> tuple[Tile, ...]:
+        """Drop everything queued, for another daemon or time; returns the places of the dropped tiles."""
         waiting = tuple(self._tiles)
         self._latest, self._tiles = {}, {}
         self._once.clear()
         return waiting
 
-    def take(self) -> bytes | None:
-        """All that waits as one message, an array of frames; of tiles only some. None: nothing waits."""
-        self.some.clear()
+    def next_message(self) -> bytes | None:
+        """All queued frames as one message, an array, with a part of the tiles. None: nothing is queued."""
+        self.pending.clear()
         bodies = [*self._once, *self._latest.values()]
         self._once.clear()
         self._latest = {}
@@ -91,7 +91,7 @@ class Viewer:
         if tiles:
             bodies.append(frame("map", {**self._about, "tiles": tiles}))
         if self._tiles:
-            self.some.set()
+            self.pending.set()
         return b"\xdc" + len(bodies).to_bytes(2, "big") + b"".join(bodies) if bodies else None
 
 
@@ -99,10 +99,10 @@ Row = tuple[Any, ...]
 
 
 class History:
-    """The last ten minutes of a few figures, for plots and the way behind the robot.
+    """The last ten minutes of some values, for plots and the trajectory.
 
-    Columns: t_mono; x, y, yaw; the larger sigma (m); bound (m); computing time of a cycle (us); how late the pose was
-    published (s); links used; state; map jumps; map. None: not known.
+    Columns: t_mono; x, y, yaw; the larger sigma (m); protection level (m); computing time of a cycle (us); age of the
+    pose at publication (s); links used; state; map jumps; map. None: unknown.
     """
 
     COLUMNS: ClassVar = ("t", "x", "y", "yaw", "sigma", "bound", "cycle", "late", "used", "state", "jumps", "map")
@@ -110,8 +110,8 @@ class History:
     def __init__(self) -> None:
         self.rows: deque[Row] = deque(maxlen=ROWS)
 
-    def take(self, pose: Pose, used: int | None) -> Row | None:
-        """A snapshot; returns the row that it has made, None: it is not time for one."""
+    def add(self, pose: Pose, used: int | None) -> Row | None:
+        """Add a snapshot; returns the new row, or None where none is due."""
         if self.rows and 0.0 <= pose.t_mono - self.rows[-1][0] < ROW_S:
             return None
         x, y, yaw = pose.pose or (None, None, None)
@@ -125,11 +125,11 @@ class History:
 
 
 class Hub:
-    """Hands on what comes from the stream, and tells newcomers how things stand.
+    """Distributes the stream to all viewers, and sends the present state to new ones.
 
     Attributes:
-        viewers: that are there. session: counts daemons that were met; what was told of an earlier one counts no more.
-        up: whether the daemon is there; why: if not, why.
+        viewers: connected ones. session: counts connected daemons; data of an earlier session are invalid.
+        up: whether the daemon is connected; why: the cause if it is not.
     """
 
     def __init__(self) -> None:
@@ -143,27 +143,27 @@ class Hub:
         self._about: dict[str, object] = {}
         self._used: int | None = None
 
-    def met(self) -> None:
-        """A daemon is there, perhaps another one: what was known counts no more."""
+    def connected(self) -> None:
+        """A daemon has connected, perhaps another one: drop all older data."""
         self.session += 1
         self.up, self.why = True, ""
         self.history = History()
         self._latest, self._tiles = {}, {}
         self._loops.clear()
         for viewer in self.viewers:
-            viewer.forget()
-        self._tell_up()
+            viewer.clear()
+        self._broadcast_daemon()
 
-    def lost(self, why: str) -> None:
-        """It is not there."""
+    def disconnected(self, why: str) -> None:
+        """The daemon is not connected."""
         if self.up or why != self.why:
             self.up, self.why = False, why
-            self._tell_up()
+            self._broadcast_daemon()
 
-    def take(self, data: Data) -> None:
-        """One frame of the stream."""
+    def distribute(self, data: Data) -> None:
+        """Distribute one stream message."""
         if isinstance(data, MapTiles):
-            self._take_tiles(data)
+            self._distribute_tiles(data)
             return
         topic = TOPIC_OF[type(data)]
         body, once = frame(topic, data), topic in ONCE
@@ -175,27 +175,27 @@ class Hub:
             viewer.put(topic, body, once)
         if isinstance(data, Lights):
             self._used = data.used
-        elif isinstance(data, Pose) and (row := self.history.take(data, self._used)) is not None:
-            self.tell("row", row)
+        elif isinstance(data, Pose) and (row := self.history.add(data, self._used)) is not None:
+            self.broadcast("row", row)
 
-    def tell(self, topic: str, data: object) -> None:
-        """Tell all, once."""
+    def broadcast(self, topic: str, data: object) -> None:
+        """Send an event to all viewers."""
         body = frame(topic, data)
         for viewer in self.viewers:
             viewer.put(topic, body, once=True)
 
     def welcome(self, viewer: Viewer) -> None:
-        """Tell one how things stand."""
+        """Add a viewer and send it the present state."""
         self.viewers.add(viewer)
         viewer.put("daemon", frame("daemon", self._daemon()), once=True)
         viewer.put("history", frame("history", list(self.history.rows)), once=True)
-        if self._loops:  # as what has been, not as what happens now
+        if self._loops:  # as history, not as new events
             viewer.put("loops", frame("loops", list(self._loops)), once=True)
         for topic, body in self._latest.items():
             viewer.put(topic, body)
         viewer.put_tiles(self._about, self._tiles.items())
 
-    def _take_tiles(self, data: MapTiles) -> None:
+    def _distribute_tiles(self, data: MapTiles) -> None:
         self._about = about_of(data)
         tiles = [((column, row), cells) for column, row, cells in data.tiles]
         self._tiles.update(tiles)
@@ -205,10 +205,10 @@ class Hub:
     def _daemon(self) -> dict[str, object]:
         return {"session": self.session, "up": self.up, "why": self.why}
 
-    def _tell_up(self) -> None:
-        self.tell("daemon", self._daemon())
+    def _broadcast_daemon(self) -> None:
+        self.broadcast("daemon", self._daemon())
 
 
 def about_of(data: MapTiles) -> dict[str, object]:
-    """What is the same for all tiles of a map."""
+    """Data common to all tiles of a map."""
     return {"map_id": data.map_id, "resolution": data.resolution, "side": data.side, "unit": data.unit}

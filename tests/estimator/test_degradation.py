@@ -1,4 +1,4 @@
-"""What a step leaves out on each rung, and that it takes everything up again afterwards."""
+"""What a step leaves out on each level, and that it takes everything up again afterwards."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.measurements import UNLIMITED, Array, Limits, Odometry, Record, Rung
+from estimator.measurements import UNLIMITED, Array, DegradationLevel, Limits, Odometry, Record
 from estimator.numerics import se2
 from estimator.pipeline import State, new_state, step
 from estimator.result import Reason, StepResult
@@ -29,13 +29,13 @@ def off(result: StepResult, T: Array) -> float:
     return float(np.hypot(*se2.between(T, result.T_odom_base)[:2]))
 
 
-@pytest.mark.parametrize("rung", [Rung.NO_MAP, Rung.CARRIED])
-def test_no_keyframe_and_no_job_comes_of_a_step_without_map_work(rung: Rung) -> None:
+@pytest.mark.parametrize("level", [DegradationLevel.NO_MAP, DegradationLevel.CARRIED])
+def test_no_keyframe_and_no_job_comes_of_a_step_without_map_work(level: DegradationLevel) -> None:
     state = new_state()
     for k in range(20):
         at(state, k, UNLIMITED)
     before, map_before = len(state.map.keyframes), state.matching.local_map
-    left_out = [at(state, k, replace(UNLIMITED, rung=rung)) for k in range(20, 80)]
+    left_out = [at(state, k, replace(UNLIMITED, level=level)) for k in range(20, 80)]
     assert all(result.keyframe < 0 and not result.jobs for result in left_out)
     assert len(state.map.keyframes) == before
     assert state.matching.local_map is map_before
@@ -46,7 +46,7 @@ def test_without_map_work_scans_still_hold_the_pose() -> None:
     state = new_state()
     for k in range(20):
         at(state, k, UNLIMITED)
-    results = [at(state, k, replace(UNLIMITED, rung=Rung.NO_MAP)) for k in range(20, 60)]
+    results = [at(state, k, replace(UNLIMITED, level=DegradationLevel.NO_MAP)) for k in range(20, 60)]
     assert all(result.match is not None and result.match.ok for result in results)
     assert max(off(result, TRUTH[k + 20]) for k, result in enumerate(results)) < 0.02
 
@@ -55,7 +55,7 @@ def test_carried_by_the_wheels_scans_are_passed_over_and_fit_again_afterwards() 
     state = new_state()
     for k in range(40):
         at(state, k, UNLIMITED)
-    results = [at(state, k, replace(UNLIMITED, rung=Rung.CARRIED)) for k in range(40, 140)]
+    results = [at(state, k, replace(UNLIMITED, level=DegradationLevel.CARRIED)) for k in range(40, 140)]
     assert {result.match and result.match.reason for result in results} == {Reason.PASSED_OVER}
     assert off(results[-1], TRUTH[139]) > 0.02, "wheels that count 2 % too far carry the pose, and nothing corrects it"
     grown = np.diag(results[-1].covariance) - np.diag(results[0].covariance)
@@ -71,7 +71,10 @@ def test_carried_by_nothing_the_velocity_dies() -> None:
     state = new_state()
     for k in range(40):
         at(state, k, UNLIMITED, odometry=False)
-    speed = [np.hypot(*at(state, k, replace(UNLIMITED, rung=Rung.CARRIED), False).velocity[:2]) for k in range(40, 70)]
+    speed = [
+        np.hypot(*at(state, k, replace(UNLIMITED, level=DegradationLevel.CARRIED), False).velocity[:2])
+        for k in range(40, 70)
+    ]
     assert speed[0] > 0.1
     assert speed[-1] < 0.01
 
@@ -80,6 +83,6 @@ def test_thinned_is_everything_within_its_caps() -> None:
     one, other = new_state(), new_state()
     caps = replace(UNLIMITED, icp_iterations=4, points=200)
     for k in range(60):
-        a, b = at(one, k, caps), at(other, k, replace(caps, rung=Rung.THINNED))
+        a, b = at(one, k, caps), at(other, k, replace(caps, level=DegradationLevel.THINNED))
         assert np.array_equal(a.T_odom_base, b.T_odom_base)
         assert a.keyframe == b.keyframe

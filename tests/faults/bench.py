@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import LidarModel, Unit
 from hal.fake.lidar.scan import FakeScan
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import VALID, LidarGeometry, LidarStatus, Link, RawScan
 

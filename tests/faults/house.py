@@ -26,11 +26,11 @@ from daemon.snapshot import Snapshot, State
 from estimator.mapping.map_snapshot import Identity
 from estimator.stored_map import image_of
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import UTM_30LX, LidarModel, Unit
 from hal.fake.odometry import FakeOdometry
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inputs import InputPort
 from tools.sim.ceiling.ceiling import Effects
 from tools.sim.ceiling.effects import IDEAL
@@ -137,7 +137,7 @@ class House:
         assert light is not None
         adc = light_up(self.world, light, self.clock)["adc"]
         self._port = InputPort(self.clock, "", _PORT)
-        self.wheels = FakeOdometry(self._reading, lambda data: self._port.take(data, self.clock.now()))
+        self.wheels = FakeOdometry(self._reading, lambda data: self._port.receive(data, self.clock.now()))
         self._rolling = asyncio.create_task(self.wheels.run())
         self.faults = FaultSchedule({"lidar": self.lidar, "adc": adc, "odometry": self.wheels})
         self._ear = _Ear(self.loop.time)
@@ -184,7 +184,7 @@ class House:
 
     def drawn(self) -> bytes:
         """The map as it is now, as a file."""
-        state, lights = self.daemon.keeper._state(), self.world.lights
+        state, lights = self.daemon.autosaver._state(), self.world.lights
         assert state is not None
         assert lights is not None
         who = Identity(map_id=1, name="", surveyed=True, survey=digest_of(lights.survey), session=1)

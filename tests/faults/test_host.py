@@ -19,14 +19,14 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli.status import NoAnswer, Reader
 from daemon.health.faults import Fault
+from daemon.publish.modbus.client import NoAnswer, Reader
 from daemon.publish.modbus.holding import CommandCode, Outcome
 from daemon.publish.modbus.parts_block import FAULTS
 from daemon.runtime.heartbeat import BEAT_S, OVER_S
 from daemon.snapshot import State
-from tests.daemon.scenarios.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
-from tests.daemon.scenarios.test_store_process import ask
+from tests.daemon.processes.test_process import PATIENCE_S, ROOT, Running, fake_lidar, running
+from tests.daemon.processes.test_store_process import ask
 
 pytestmark = [pytest.mark.realtime, pytest.mark.system, pytest.mark.timeout(600)]
 

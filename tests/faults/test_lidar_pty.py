@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from hal.clock import SystemClock
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import UTM_30LX
-from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule
+from hal.fake.transport.pty_server import PtyServer
 from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import VALID, Link, RawScan
 from hal.port.opening import open_port

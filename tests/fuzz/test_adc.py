@@ -25,23 +25,23 @@ from tests.hal.photodiode.bench import Bench, falsehoods, on_fake
 
 @given(data=st.binary(max_size=400), extra=st.integers(0, 100))
 def test_any_bytes_make_words_or_none(data: bytes, extra: int) -> None:
-    words, blemish, census = inspect(data, len(data) + extra, 0xF000, 12)
+    words, blemish, defects = inspect(data, len(data) + extra, 0xF000, 12)
     raw = [int.from_bytes(data[k : k + 2], "big") for k in range(0, len(data) // 2 * 2, 2)]
     assert words.tolist() == [word & 0xFFF for word in raw[: words.size]]
     assert (Blemish.SHORT in blemish) == (words.size < (len(data) + extra) // 2)
     assert (Blemish.MISALIGNED in blemish) == any(word & 0xF000 for word in raw[: words.size])
     assert all(word == 0xFFFF for word in raw[words.size :])
-    assert 0.0 <= census.clipped <= 1.0
-    assert 0.0 <= census.misaligned <= 1.0
+    assert 0.0 <= defects.clipped <= 1.0
+    assert 0.0 <= defects.misaligned <= 1.0
     if blemish == Blemish.NONE and words.size:
         assert 0 < words.min() <= words.max() < 4095
 
 
 @given(answers=st.lists(st.one_of(st.none(), st.binary(max_size=3)), min_size=4, max_size=4))
 def test_any_answers_are_judged(answers: list[bytes | None]) -> None:
-    assert isinstance(mcp3221.judge((answers[0],)), str)
-    assert isinstance(adc121c021.judge(tuple(answers)), str)
-    assert isinstance(ads1x15.judge((answers[0], answers[1])), str)
+    assert isinstance(mcp3221.mismatch((answers[0],)), str)
+    assert isinstance(adc121c021.mismatch(tuple(answers)), str)
+    assert isinstance(ads1x15.mismatch((answers[0], answers[1])), str)
     assert isinstance(ads1x15.same_configuration(answers[2] or b"", ads1x15.Configuration()), bool)
 
 
@@ -53,7 +53,7 @@ def test_any_answers_are_judged(answers: list[bytes | None]) -> None:
 def test_any_durations_are_timed(spans: list[float], length: int, spread: float) -> None:
     scl = SclClock(length, (10 + 9 * length) / 400e3 + 1e-4, 28 / 400e3 + 1e-4, spread)
     for k, span in enumerate(spans):
-        timing = scl.take(10.0 * k, 10.0 * k + span)
+        timing = scl.add(10.0 * k, 10.0 * k + span)
         assert np.isfinite([timing.t_first, timing.slack_s, timing.rate_hz]).all()
         assert timing.slack_s >= 0.0
         assert timing.rate_hz > 0.0

@@ -20,13 +20,13 @@ from hal.bus import i2c_frames as frames
 from hal.bus.i2c import MAX_LENGTH, MAX_MESSAGES, AsyncBus, Message, OnRead, Transferred, read, write
 from hal.bus.i2c_remote import RemoteBus, clock_name
 from hal.bus.i2c_server import BusServer
+from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import HalError
-from hal.photodiode.adapter_limits import Capability
-from hal.photodiode.diagnosis import Judge
+from hal.photodiode.adapter_limits import AdapterLimits
+from hal.photodiode.diagnosis import BlockDiagnosis
 from hal.photodiode.mcp3221 import CHIP
 from hal.photodiode.sampler import Sampler
-from hal.port.opening import open_bus
 
 SIZES = [pytest.param(400_000, id="quick"), pytest.param(10_000_000, id="10MB", marks=pytest.mark.slow)]
 PROTOCOL = 4096
@@ -197,17 +197,17 @@ def test_any_block_is_judged(size: int) -> None:
     chance = random.Random(3)
     length, scl = 2222, 400e3
     span = (10 + 9 * length) / scl + 60e-6
-    sampler = Sampler(CHIP, Capability(length, span, 28 / scl + 60e-6))
+    sampler = Sampler(CHIP, AdapterLimits(length, span, 28 / scl + 60e-6))
     level = {"now": 0.0}
-    judge = Judge("x", CHIP, 0x4D, lambda: None if chance.random() < 0.5 else level["now"])
+    diagnosis = BlockDiagnosis("x", CHIP, 0x4D, lambda: None if chance.random() < 0.5 else level["now"])
     t, seen, sound = 0.0, 0, 0
     last = -1
     while seen < size:
         data = block_of(chance, length)
         late = chance.choice((0.0, 1e-6, 1e-3, 0.3))
-        block, census = sampler.take(Transferred(t, t + span + late, (data,)), chance.randrange(3) + (last + 1))
+        block, defects = sampler.to_block(Transferred(t, t + span + late, (data,)), chance.randrange(3) + (last + 1))
         level["now"] = chance.uniform(-0.1, 1.1)
-        verdict = judge.look(block, census)
+        verdict = diagnosis.add(block, defects)
         assert block.seq > last
         assert block.words.size <= length // 2
         assert block.words.size == 0 or 0 <= int(block.words.min()) <= int(block.words.max()) <= 4095

@@ -11,7 +11,7 @@ import tracemalloc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.publish.modbus import registers, server
+from daemon.publish.modbus import counts, registers, tcp_endpoint
 from daemon.publish.modbus.holding import Holding
 from daemon.publish.modbus.requests import MAX_FRAME, Responder, frame_size
 from hal.clock import run_virtual
@@ -101,7 +101,7 @@ def test_a_tcp_stream_cut_anywhere(parts: list[bytes], cuts: list[int]) -> None:
     expected, faulty = whole_frames(stream)
 
     async def run() -> None:
-        endpoint = server.TcpEndpoint(responder(), server.Counts())
+        endpoint = tcp_endpoint.TcpEndpoint(responder(), counts.Counts())
         connection, wire = plugged(endpoint)
         start, turn = 0, 0
         while start < len(stream) and not wire.gone:
@@ -124,7 +124,7 @@ def test_hostile_bytes_leave_no_memory_behind() -> None:
     chance = random.Random(20_240_501)
 
     async def storm(count: int) -> None:
-        endpoint = server.TcpEndpoint(responder(), server.Counts())
+        endpoint = tcp_endpoint.TcpEndpoint(responder(), counts.Counts())
         for _ in range(count // 20):
             connection, wire = plugged(endpoint)
             for _ in range(20):

@@ -99,7 +99,7 @@ def test_whatever_comes_in_what_is_delivered_is_sound(arrivals: list[tuple[bytes
     t = 1000.0
     for data, pause in arrivals:
         t += pause
-        port.take(data, t)
+        port.receive(data, t)
     counts = port.counts.values()
     told = sum(c.received + c.late + c.duplicate + c.foreign for c in counts)
     assert told + port.invalid == len(arrivals)

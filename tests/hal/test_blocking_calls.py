@@ -12,16 +12,16 @@ from typing import Any
 
 import pytest
 
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 from hal.net import inet
 from hal.port.opening import open_port
 
 
 def test_what_it_returns_and_raises_is_had_where_it_is_awaited() -> None:
     async def run() -> None:
-        assert await beside(threading.current_thread, "x") is not threading.current_thread()
+        assert await run_in_thread(threading.current_thread, "x") is not threading.current_thread()
         with pytest.raises(ValueError, match="invalid literal"):
-            await beside(partial(int, "x"), "x")
+            await run_in_thread(partial(int, "x"), "x")
 
     asyncio.run(run())
 
@@ -29,7 +29,7 @@ def test_what_it_returns_and_raises_is_had_where_it_is_awaited() -> None:
 def test_nobody_minds_the_end_of_what_was_given_up() -> None:
     async def run() -> None:
         go = threading.Event()
-        work = beside(go.wait, "x")
+        work = run_in_thread(go.wait, "x")
         work.cancel()
         go.set()
         await asyncio.sleep(0.02)

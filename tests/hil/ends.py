@@ -21,22 +21,23 @@ import pytest
 from daemon.config.endpoints import LidarPlace, parse_lidar
 from hal.adc import RawSamples
 from hal.bus.i2c import BusOpener
+from hal.bus.opening import open_bus
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual
 from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.light import OrdinaryLamps
-from hal.fake.control import Control
+from hal.fake.faults.control import Control
+from hal.fake.faults.schedule import FaultSchedule, Target
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import UTM_30LX, Unit
 from hal.fake.lidar.scan_world import Room
-from hal.fake.schedule import FaultSchedule, Target
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.hokuyo.driver import HokuyoDriver
+from hal.hokuyo.probe import Finding, identify_at
 from hal.lidar import RawScan
 from hal.photodiode.chips import chip_named
 from hal.photodiode.driver import PhotodiodeAdc
-from hal.port.opening import open_bus, open_port
+from hal.port.opening import open_port
 from hal.port.port import PortOpener
-from hal.probe import Finding, identify_at
 
 FAKE: Final = "fake"
 NONE: Final = "none"
@@ -52,7 +53,7 @@ class Operator(Protocol):
     """Whoever plugs, covers and carries."""
 
     async def ask(self, request: str, order: str) -> None:
-        """Have something done; returns when it has been. ``order`` says it in words of ``hal.fake.control``."""
+        """Have something done; returns when it has been. ``order`` says it in words of ``hal.fake.faults.control``."""
         ...
 
     def tell(self, request: str, order: str) -> None:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import pytest
 
 from hal.bus.i2c import NACKS, AsyncBus, BusOpener, read
+from hal.bus.opening import open_bus
 from hal.errors import DeviceMissing, HalError
 from hal.photodiode.io_errors import explain, policy_for
 from hal.photodiode.probe import probe_bus
-from hal.port.opening import open_bus
 from tests.hil.ends import AdcEnd, LidarEnd
 
 

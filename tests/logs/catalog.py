@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from daemon.cli.replay import Outcome, replay
 from daemon.config.schema import Config
+from daemon.replay.log_replay import Outcome, replay
 from daemon.replay.trajectories import Ledger
 from tests.daemon.replay.room import carmen, drive
 from tests.logs import made

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli.replay import Outcome
+from daemon.replay.log_replay import Outcome
 from tests.logs.catalog import replayed
 from tests.logs.entries import BY_NAME
 

@@ -96,8 +96,8 @@ def asked(parser: argparse.ArgumentParser, names: list[str]) -> tuple[list[Entry
     except NotThere as error:
         parser.error(str(error))
     if data is not None or not all(entry.source for entry in entries):
-        from daemon.cli import parser as cli_parser
         from daemon.runtime import warmup
+        from daemon.system import console
 
-        warmup.load_aloud(cli_parser.say, "warm", warmup.load)
+        warmup.load_aloud(console.say, "warm", warmup.load)
     return entries, data

@@ -20,15 +20,15 @@ from typing import Final
 from daemon.app import Daemon
 from daemon.config.endpoints import NO_DEVICE
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
+from daemon.devices.light_setup import Lights
 from daemon.recording.recorder import Recorder
-from daemon.runtime.light_setup import Lights
 from estimator.cdma.air_interface import PROFILE_A
 from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import Unit
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inputs import InputPort
-from tests.daemon.lightroom import SURVEY, Lit, plugged
+from tests.daemon.support.light_room import SURVEY, Lit, plugged
 from tools.bench.world.room import LIDAR, room
 from tools.sim.feed import feed_odometry
 from tools.sim.harness import DEVICE, world
@@ -107,7 +107,7 @@ async def _recorded(making: Making, folder: Path) -> None:
     for part in ("odometry", "imu"):
         daemon.network.parts.pop(part, None)
     port.send_odometry_to(recorder.on_odometry(daemon.cycle.inbox.put_odometry))
-    rolling = asyncio.create_task(feed_odometry(scene, lambda data: port.take(data, clock.now())))
+    rolling = asyncio.create_task(feed_odometry(scene, lambda data: port.receive(data, clock.now())))
     stop = asyncio.Event()
     asyncio.get_running_loop().call_later(making.seconds, stop.set)
     try:

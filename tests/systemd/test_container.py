@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.system import logging
+from daemon.health import journal_fields
 from tests.systemd import container, kernels
 from tests.systemd.container import Container
 from tests.systemd.pages import dead_links
@@ -210,7 +210,7 @@ def test_what_listens_to_the_daemon_reaches_it_by_its_group_and_others_do_not(ma
 def test_the_journal_has_fields(machine: Container) -> None:
     text = machine.run("journalctl", "--no-pager", "-o", "json", "-u", UNIT)
     entries = [json.loads(line) for line in text.splitlines() if line.startswith("{")]
-    told = [entry for entry in entries if entry.get("MESSAGE_ID") == logging.STATE_ID]
+    told = [entry for entry in entries if entry.get("MESSAGE_ID") == journal_fields.STATE_ID]
     assert told
     assert all(entry["LUMILOOP_STATE"] and entry["_SYSTEMD_UNIT"] == UNIT for entry in told)
     assert "What can be done" in machine.run("journalctl", "--no-pager", "--catalog", "-u", UNIT)

@@ -14,7 +14,7 @@ from typing import Final
 import pytest
 
 from daemon.cli import parser
-from daemon.cli.parser import USAGE
+from daemon.system.console import USAGE
 from tests.systemd import pages
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"

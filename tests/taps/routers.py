@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from daemon.config.schema import Config
-from taps.zenoh_session import config
+from taps.zenoh_session import session_config
 
 
 def free_port() -> int:
@@ -32,7 +32,7 @@ class Router:
         self.begin()
 
     def begin(self) -> None:
-        self._session = zenoh.open(config("router", self.address))
+        self._session = zenoh.open(session_config("router", self.address))
 
     def end(self) -> None:
         if self._session is not None:

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from daemon.maps.tiles import MapTiles
-from daemon.publish.stream_server import SIDE, StreamServer
-from daemon.snapshot import LightFix, LightLink, LightPicture, LinkUse, Pulse, Snapshot, State, Trust
-from tests.daemon.publish.test_stream_server import raw_scan
+from daemon.publish.stream.server import SIDE, StreamServer
+from daemon.snapshot import CycleTiming, LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
+from tests.daemon.publish.stream.test_server import raw_scan
 
 LINKS = (
     LightLink(5, 12, LinkUse.ACCEPTED, 1e-6, 0.01),
@@ -39,7 +39,7 @@ SNAPSHOT = Snapshot(
     scan_rate=10.0,
     cycle_us=900,
     trust=Trust(horizontal_m=0.1, limit_m=0.3, laser=True, light=True),
-    pulse=Pulse(cycle=(900, 1500, 2000), late=(50, 90, 120)),
+    pulse=CycleTiming(cycle=(900, 1500, 2000), late=(50, 90, 120)),
 )
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from daemon.cli import parser as cli_parser
 from daemon.diagnosis.host import Host
+from daemon.system import console
 from tests.daemon.commissioning.test_planning import room, write_pgm
 from tests.daemon.diagnosis.test_doctor import Computer
 
@@ -61,7 +62,7 @@ def test_the_doctor_of_the_documents(
     monkeypatch.setattr("daemon.cli.doctor.Host", Computer)
     assert (
         cli_parser.main([str(tmp_path / Path(word).name) if word.startswith("/") else word for word in words])
-        == cli_parser.OK
+        == console.OK
     )
     assert "nothing has to be fixed" in capsys.readouterr().out
     assert issubclass(Computer, Host)
@@ -74,7 +75,7 @@ def test_the_plans_of_the_documents(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     ran = 0
     for words in commands(ROOT / "docs" / "planning.md"):
         if words[0] == "plan":
-            assert cli_parser.main(words) == cli_parser.OK, words
+            assert cli_parser.main(words) == console.OK, words
             ran += 1
     assert ran == 3
     assert (tmp_path / "plan" / "lights.toml").exists()
@@ -88,7 +89,7 @@ def test_the_exports_of_the_documents(recording: Path, tmp_path: Path, monkeypat
     ran = 0
     for words in commands(ROOT / "docs" / "formats.md"):
         if words[0] == "export":
-            assert cli_parser.main(words) == cli_parser.OK, words
+            assert cli_parser.main(words) == console.OK, words
             (tmp_path / "torn.mcap").write_bytes((tmp_path / "drive.mcap").read_bytes()[:-500])
             ran += 1
     assert ran == 2
@@ -104,7 +105,7 @@ def test_the_program_of_the_documents_reads_what_was_exported(
         r"^```python\n(.*?)^```", (ROOT / "docs" / "formats.md").read_text(), re.MULTILINE | re.DOTALL
     )
     monkeypatch.chdir(tmp_path)
-    assert cli_parser.main(["export", str(recording), "--mcap", "drive.mcap"]) == cli_parser.OK
+    assert cli_parser.main(["export", str(recording), "--mcap", "drive.mcap"]) == console.OK
     capsys.readouterr()
     exec(compile(program, "formats.md", "exec"), {})
     said = capsys.readouterr().out.splitlines()

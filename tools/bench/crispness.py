@@ -23,9 +23,9 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from daemon.cli.replay import Outcome, replay
 from daemon.config.schema import Config
 from daemon.devices.conversion import ScanBridge
+from daemon.replay.log_replay import Outcome, replay
 from daemon.replay.sources import open_log
 from estimator.measurements import Array, Scan
 from estimator.numerics import se2

@@ -25,10 +25,10 @@ from typing import Final
 
 import numpy as np
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig, PoseConfig
-from daemon.runtime.light_setup import Lights
-from daemon.runtime.snapshot_builder import Painter
+from daemon.devices.light_setup import Lights
+from daemon.runtime.snapshot_builder import SnapshotBuilder
 from daemon.runtime.warmup import load
 from estimator import pipeline
 from estimator.cdma import decoder
@@ -120,7 +120,7 @@ def make_daemon(drive: EndlessDrive, clock: Clock, receiver: str, modbus: int) -
         pose=PoseConfig(receivers=(receiver,)),
     )
     # the budget is told processor time, so that the work that is measured does not hang on what other programs do
-    world = World(clock=clock, make_lidar=lidar, make_adc=adc, lights=told, stopwatch=time.thread_time)
+    world = Environment(clock=clock, make_lidar=lidar, make_adc=adc, lights=told, stopwatch=time.thread_time)
     daemon = Daemon(settings, world)
     daemon.cycle.parts.budget.learn_code(load(told).code_us)
     return daemon
@@ -191,7 +191,7 @@ def instrument(stages: Stages, daemon: Daemon) -> None:
     cycle = daemon.cycle
     for owner, attribute, stage in (
         (cycle, "_bridge", "bridge"), (cycle, "_step", "step"), (cycle, "_judge", "judge"), (cycle, "_publish",
-        "publish"), (Painter, "paint", "judge"), (decoder, "decode", "decode"), (decoder, "search", "search"),
+        "publish"), (SnapshotBuilder, "build", "judge"), (decoder, "decode", "decode"), (decoder, "search", "search"),
         (light_filter, "update", "lights"), (light_filter, "predict", "lights"), (map_odom_filter, "on_lights",
         "lights"), (pipeline, "virtual_frame", "match"), (pipeline, "match_scan", "match"), (pipeline, "fuse", "fuse"),
         (pipeline, "predict", "fuse"), (pipeline, "keyframe_due", "map"), (pipeline, "lay_keyframe", "map"), (pipeline,

@@ -11,8 +11,8 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from daemon.cli.replay import Outcome, replay
 from daemon.config.schema import Config
+from daemon.replay.log_replay import Outcome, replay
 from tools import convert
 from tools.ci.figures import Figure, bounded
 from tools.relations import SPLIT_S, Errors, evaluate, read_relations

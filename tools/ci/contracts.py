@@ -30,10 +30,12 @@ from daemon.config import loader
 from daemon.health.faults import FAULTS
 from daemon.health.reasons import REASONS
 from daemon.maps import container
-from daemon.publish import stream_fields, stream_server, udp_subscriptions
+from daemon.publish import udp_subscriptions
 from daemon.publish.modbus import holding, integrity_block, lights_block, parts_block, registers, timing_block
 from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.points import Layout
+from daemon.publish.stream import fields as stream_fields
+from daemon.publish.stream import server as stream_server
 from daemon.recording.recorder import CommandEntry, CycleEntry
 from hal.net import input_codec
 from hal.replay import recording

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.cli.status import NoAnswer, Reader, Reading
+from daemon.publish.modbus.client import NoAnswer, Reader, Reading
 from daemon.snapshot import State
 from tools.demo.acts import ROBOT, OrderRefused, Stage, complaint, keyboard, pressed, programme
 from tools.demo.score import READY, Score, Track, cause, pose_of, summary, verdict

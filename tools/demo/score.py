@@ -11,8 +11,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from daemon.cli.status import Reading
 from daemon.health.reasons import REASONS, Reason
+from daemon.publish.modbus.client import Reading
 from daemon.snapshot import State
 from tools.demo.acts import Act
 

@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from aiohttp import ClientSession, ClientWebSocketResponse
 
-from daemon.cli.status import Reader
+from daemon.publish.modbus.client import Reader
 from tools.demo.run import (
     Patience,
     free_port,

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from daemon.cli import parser as cli_parser
+from daemon.system import console
 
 RESOLUTION_M: Final = 0.05
 FREE, WALL, UNKNOWN = 254, 0, 205
@@ -73,14 +74,14 @@ def main(arguments: list[str] | None = None) -> int:
         folder, said = Path(name), io.StringIO()
         with contextlib.redirect_stdout(said):
             code = cli_parser.main(["plan", str(write_floor(folder)), "--out", str(folder / "plan")])
-        if code != cli_parser.OK:
+        if code != console.OK:
             return code
         told = [line for line in said.getvalue().splitlines() if line and str(folder) not in line]
         page = options.docs / "planning.md"
         page.write_text(shown(page.read_text(), told))
         shutil.copyfile(folder / "plan" / "plan.png", options.docs / "images" / "plan.png")
     print("\n".join(told))
-    return cli_parser.OK
+    return console.OK
 
 
 if __name__ == "__main__":

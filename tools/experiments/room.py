@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.calibration.calibrate import calibrate
+from estimator.calibration.calibrate import calibrate_lamps
 from estimator.calibration.observations import Rows
 from estimator.calibration.parameters import Priors
 from estimator.calibration.residual_map_fit import learn
@@ -122,7 +122,7 @@ def taught(run: LightRun) -> tuple[Any, ResidualCorrections]:
     parts = [rows_of(epoch, other, index, rng) for n, epoch in enumerate(other.light()) if n % 3 == 0]
     pose, lamp, amplitude, sigma, t = (np.concatenate(field) for field in zip(*parts, strict=True))
     rows = Rows(pose, lamp.astype(np.int64), amplitude, sigma, t)
-    found = calibrate(run.survey, rows, Priors(lever=0.0))
+    found = calibrate_lamps(run.survey, rows, Priors(lever=0.0))
     survey = replace(found.survey, lamps=tuple(replace(lamp, sigma_ln=0.03) for lamp in found.survey.lamps))
     return survey, ResidualCorrections(learn(found.survey, found.rows.chosen(found.used)), survey.receiver)
 

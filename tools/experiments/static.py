@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.calibration.calibrate import calibrate
+from estimator.calibration.calibrate import calibrate_lamps
 from estimator.calibration.observations import Rows, model
 from estimator.calibration.parameters import Priors
 from estimator.calibration.residual_map_fit import learn
@@ -82,7 +82,7 @@ def unit_of(data: Campaign, at: Index) -> float:
 def teach(data: Campaign, at: Index, unit: float, with_map: bool = True) -> Taught:
     """Calibrate on some places."""
     rows = rows_of(data, at, unit)
-    found = calibrate(nominal(data), rows, PRIORS)
+    found = calibrate_lamps(nominal(data), rows, PRIORS)
     return Taught(found.survey, learn(found.survey, rows, cell=CELL_M) if with_map else None, found.scale)
 
 
@@ -105,7 +105,7 @@ def updated(taught: Taught, data: Campaign, at: Index, unit: float, priors: Prio
     z = float(data.places[:, 2].mean())
     lamps = tuple(replace(lamp, sigma_ln=DRIFT_LN) for lamp in taught.survey.lamps)
     survey = replace(taught.survey, lamps=lamps, receiver=replace(taught.survey.receiver, z=z))
-    survey = calibrate(survey, flat, priors).survey
+    survey = calibrate_lamps(survey, flat, priors).survey
     if taught.residuals is None:
         return replace(taught, survey=survey)
     aged = replace(taught.residuals, noise=float(np.hypot(taught.residuals.noise, DRIFT_LN)))

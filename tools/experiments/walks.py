@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.calibration.calibrate import calibrate
+from estimator.calibration.calibrate import calibrate_lamps
 from estimator.calibration.observations import Rows, model
 from estimator.calibration.parameters import Priors
 from estimator.cdma.epoch import BlockFlag, LightEpoch
@@ -89,7 +89,7 @@ def known(data: Walk, which: Mask) -> Known:
     rows = rows_of(data, which, 1.0, 0.0)
     out, _ = model(pack_lamps(survey.lamps, survey.depth), pack_receiver(survey.receiver), rows.pose, rows.lamp, 0.01)
     unit = float(np.exp(np.median(np.log(out[:, 0] / rows.amplitude))))
-    tried = [(calibrate(survey, rows_of(data, which, unit, lag), PRIORS), lag) for lag in LAGS_S]
+    tried = [(calibrate_lamps(survey, rows_of(data, which, unit, lag), PRIORS), lag) for lag in LAGS_S]
     best, lag = min(tried, key=lambda one: float(np.mean(np.minimum((one[0].after / 0.1) ** 2, 4.0))))
     lamps = tuple(replace(lamp, sigma_ln=0.05) for lamp in best.survey.lamps)
     return Known(replace(best.survey, lamps=lamps), unit, lag, best.scale)

@@ -12,7 +12,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from hal.fake.faults import Fault, Parameter, Vocabulary, Word
+from hal.fake.faults.orders import Fault, Parameter, Vocabulary, Word
 from tools.sim.building.world import Array
 from tools.sim.robot import Drive
 
@@ -95,7 +95,7 @@ class Movable(Protocol):
 
 
 class Hands:
-    """A :class:`hal.fake.schedule.Target` that carries the robot of a scene."""
+    """A :class:`hal.fake.faults.schedule.Target` that carries the robot of a scene."""
 
     vocabulary = VOCABULARY
 

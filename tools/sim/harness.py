@@ -16,19 +16,20 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.endpoints import NO_DEVICE
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig
 from daemon.recording.recorder import Recorder
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import Cycle, Sink
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import Sink
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule, Target
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import Unit
-from hal.fake.schedule import FaultSchedule, Target
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inputs import InputPort
 from tools.sim.building.world import Array
 from tools.sim.feed import feed_odometry
@@ -182,7 +183,7 @@ async def _main(settings: Config, scene: Scene, log: _Log, order: _Order) -> int
     return device.scans_sent
 
 
-def world(clock: LoopClock, opener: FakeOpener, sink: Sink) -> World:
+def world(clock: LoopClock, opener: FakeOpener, sink: Sink) -> Environment:
     """What the daemon meets in virtual time: no thread, no stopwatch, no chance."""
 
     async def warm() -> None:
@@ -190,7 +191,7 @@ def world(clock: LoopClock, opener: FakeOpener, sink: Sink) -> World:
 
         load()
 
-    return World(
+    return Environment(
         clock=clock,
         opener=opener,
         make_worker=CycleWorker,
@@ -209,7 +210,7 @@ def _connect_wheels(daemon: Daemon, scene: Scene, clock: LoopClock, recorder: Re
     port = InputPort(clock, "", _ANY_PORT)
     put = daemon.cycle.inbox.put_odometry
     port.send_odometry_to(put if recorder is None else recorder.on_odometry(put))
-    return asyncio.create_task(feed_odometry(scene, lambda data: port.take(data, clock.now())))
+    return asyncio.create_task(feed_odometry(scene, lambda data: port.receive(data, clock.now())))
 
 
 def _collect(log: _Log, scene: Scene, scans_sent: int) -> Run:

@@ -28,14 +28,14 @@ import numpy as np
 
 from daemon.config.survey_loader import SurveyError
 from hal.errors import HalError
-from hal.fake.control import Control, serve_control
-from hal.fake.faults import FaultError
+from hal.fake.faults.control import Control, serve_control
+from hal.fake.faults.orders import FaultError
+from hal.fake.faults.schedule import FaultSchedule, Target
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import MODELS, Unit
-from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule, Target
-from hal.fake.tcp_server import TcpServer
-from hal.run_server import work_until_told
+from hal.fake.transport.pty_server import PtyServer
+from hal.fake.transport.tcp_server import TcpServer
+from hal.run_server import run_until_stopped
 from tools.sim.building.buildings import BUILDINGS
 from tools.sim.ceiling.ceiling import Effects
 from tools.sim.feed import TumWriter, UdpSender, feed_odometry, feed_truth
@@ -156,9 +156,11 @@ async def serve(options: Options, say: Callable[[dict[str, Any]], None]) -> None
         lidar = await _connect(options, device, stack)
         feeds = _feeds(options, scene, stack)
         say({"lidar": lidar, **there})
-        await work_until_told(*feeds, seconds=options.seconds)
+        await run_until_stopped(*feeds, seconds=options.seconds)
     counts = device.counts
-    say({"scans": device.scans_sent, "sent": counts.sent, "unheard": counts.unheard, "lost": counts.lost_in_sensor})
+    say(
+        {"scans": device.scans_sent, "sent": counts.sent, "unheard": counts.without_host, "lost": counts.lost_in_sensor}
+    )
 
 
 async def _light_up(

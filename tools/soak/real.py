@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from daemon.cli.status import NoAnswer, Reader
+from daemon.publish.modbus.client import NoAnswer, Reader
 from daemon.snapshot import State
 from tools.demo.run import (
     BUS,

@@ -19,7 +19,8 @@ from daemon.devices.conversion import ScanBridge
 from daemon.publish.modbus.server import ModbusPublisher
 from daemon.publish.udp_sender import PoseSender
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import Cycle, Parts
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import Parts
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
 from estimator.light_filter.light_channel import LightsSetup

@@ -16,10 +16,7 @@ from typing import Final
 
 from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.points import I16, I32, U16, U32, Layout, Point, Rule, Value
-from daemon.snapshot import LightFix, LinkUse, Snapshot
-
-ROWS: Final = 16
-"""Links shown, the strongest."""
+from daemon.snapshot import LISTED_LINKS, LightFix, LinkUse, Snapshot
 
 Getter = Callable[[Snapshot], Value]
 
@@ -116,7 +113,7 @@ BLOCK: Final = Block(
               can_be_unknown=False),
         Point("blocks_lost", "blocks without use", U32, _count("blocks_lost"), "Dropped, damaged, or without a cycle "
               "that could take them, since the start.", rule=Rule.WRAP, can_be_unknown=False),
-        *(point for row in range(ROWS) for point in _row(row)),
+        *(point for row in range(LISTED_LINKS) for point in _row(row)),
     ),
 )  # fmt: skip
 ROW_WORDS: Final = sum(point.wire.words for point in _row(0))

@@ -127,7 +127,7 @@ class RtuServer:
         if self._going is not None and len(data) > STRAY:  # the master does not wait for it any more
             self._give_up()
         late = t_rx - self._free > PATIENCE_S
-        for unit, body in self.frames.take(data):
+        for unit, body in self.frames.feed(data):
             if t_rx <= self._echo_until and framed(unit, body) == self._sent:
                 continue  # the answer to a write of one register is its request again
             if late and unit != BROADCAST:  # what is for all is not answered, nor repeated

@@ -68,7 +68,7 @@ class RtuFrames:
         """Drop what has been collected: the line was silent, so no request is still on its way."""
         self._skip(len(self._data))
 
-    def take(self, data: bytes) -> list[tuple[int, bytes]]:
+    def feed(self, data: bytes) -> list[tuple[int, bytes]]:
         """The requests that are whole with these bytes: unit as addressed, and the function's body.
 
         Each place is judged once, when all of the request is there that may begin at it.

@@ -14,7 +14,7 @@ from typing import Final
 
 from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.points import U16, U32, Point, Rule, Value
-from daemon.snapshot import Pulse, Snapshot, Stage
+from daemon.snapshot import CycleTiming, Snapshot, Stage
 
 RUNGS: Final = (
     "everything is done",
@@ -59,7 +59,7 @@ def _spread(row: int, place: int) -> Getter:
     return get
 
 
-def _row_of(pulse: Pulse, row: int) -> tuple[int, int, int] | None:
+def _row_of(pulse: CycleTiming, row: int) -> tuple[int, int, int] | None:
     if row < 2:
         return pulse.late if row else pulse.cycle
     return pulse.stages[row - 2] if row - 2 < len(pulse.stages) else None

@@ -1,1 +1,1 @@
-"""Wire-true fake I2C converters and their bus, with orderable faults."""
+"""Simulated I2C converters and their bus, exact byte for byte, with fault injection."""

@@ -1,9 +1,9 @@
-"""I2C chips as their data sheets describe them, byte by byte, with encoders of their own.
+"""Simulated I2C chips, byte by byte as in their data sheets.
 
-MCP3221 (Microchip DS20001732), ADC121C021 (TI SNAS415), ADS1015 and ADS1115 (TI SBAS473, SBAS444), and two bystanders
-that share their addresses: the LM75 thermometer and a 24C02 EEPROM.
+MCP3221 (Microchip DS20001732), ADC121C021 (TI SNAS415), ADS1015 and ADS1115 (TI SBAS473, SBAS444), and two other chips
+at the same addresses: the LM75 thermometer and a 24C02 EEPROM.
 
-What they do not model: noise and non-linearity (the source does, or does not), alert pins, Hs-mode, the general call.
+Not modelled: noise and non-linearity (left to the source), alert pins, Hs-mode, the general call.
 """
 
 from __future__ import annotations
@@ -16,67 +16,68 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from hal.fake.adc.i2c_timing import Line, Times
+from hal.fake.adc.i2c_timing import SclTiming, Times
 
 SampleSource = Callable[[Times], npt.NDArray[np.float64]]
-"""``t_mono`` of conversions, ascending, to the input voltage at each as a fraction of the supply.
+"""Maps ``t_mono`` of conversions, ascending, to the input voltages as fractions of the supply.
 
-It is asked when the transaction is over, so all times lie in the past. What is beyond 0 to 1 clips in the converter.
+It is called at the end of the transaction, so that all times lie in the past. Values beyond 0 to 1 clip in the
+converter.
 """
 
 T_ACQUIRE_S: Final = 1.12e-6
 """MCP3221: from the edge that starts a conversion to the opening of the sample switch."""
 STALE_S: Final = 0.1
-"""After this long without a conversion the first one holds what the switch saw when the last transaction ended."""
+"""After this long without a conversion the first one is the sample from the end of the last transaction."""
 
 
 class FakeChip(Protocol):
     """A chip on the bus.
 
     Attributes:
-        acknowledges_data: whether it takes the bytes of a write, or its address only.
+        acknowledges_data: whether it acknowledges the bytes of a write, or its address only.
     """
 
     acknowledges_data: bool
 
     def power_on(self, t_mono: float) -> None:
-        """Everything as after a reset."""
+        """Reset the chip."""
         ...
 
     def write(self, data: bytes, t_mono: float) -> None:
-        """A write message."""
+        """Process a write message."""
         ...
 
-    def read(self, length: int, line: Line) -> bytes:
-        """A read message."""
+    def read(self, length: int, line: SclTiming) -> bytes:
+        """Answer a read message."""
         ...
 
 
 def _codes(fractions: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """12 bits, straight binary."""
+    """Codes of 12 bits, straight binary."""
     return np.clip(np.floor(4096.0 * np.nan_to_num(fractions)), 0, 4095).astype(np.int64)
 
 
-class _Successive:
-    """A converter clocked by SCL: conversion k begins 8 + 18 k clocks after START."""
+class _SarConverter:
+    """A successive-approximation converter clocked by SCL: conversion k begins 8 + 18 k clocks after START."""
 
     def __init__(self, source: SampleSource) -> None:
         self._source = source
         self._t_last = float("-inf")
 
     def rest(self) -> None:
-        """After power-on nothing stale is held."""
+        """Drop the held sample (power-on)."""
         self._t_last = float("-inf")
 
-    def convert(self, length: int, line: Line) -> npt.NDArray[np.int64]:
+    def convert(self, length: int, line: SclTiming) -> npt.NDArray[np.int64]:
         count = (length + 1) // 2
         times = line.times(8 + 18 * np.arange(count)) + T_ACQUIRE_S
         stale = times[0] - self._t_last > STALE_S
-        asked = times.copy()
+        requested = times.copy()
         if stale and math.isfinite(self._t_last):
-            asked[0] = self._t_last
+            requested[0] = self._t_last
         self._t_last = line.time(10 + 9 * length)
-        return _codes(self._source(asked))
+        return _codes(self._source(requested))
 
 
 def _words(codes: npt.NDArray[np.int64], length: int) -> bytes:
@@ -85,27 +86,27 @@ def _words(codes: npt.NDArray[np.int64], length: int) -> bytes:
 
 
 class Mcp3221:
-    """No registers: a write address is acknowledged, the bytes after it are not."""
+    """The MCP3221, without registers: a write address is acknowledged, the bytes after it are not."""
 
     acknowledges_data = False
 
     def __init__(self, source: SampleSource) -> None:
-        self._converter = _Successive(source)
+        self._converter = _SarConverter(source)
 
     def power_on(self, t_mono: float) -> None:
-        """Nothing is kept."""
+        """Drop the held sample."""
         self._converter.rest()
 
     def write(self, data: bytes, t_mono: float) -> None:
-        """Device polling (6.3): the address is acknowledged, nothing else."""
+        """Device polling (6.3): only the address is acknowledged."""
 
-    def read(self, length: int, line: Line) -> bytes:
-        """``0000 D11..D8``, ``D7..D0`` again and again."""
+    def read(self, length: int, line: SclTiming) -> bytes:
+        """Conversions ``0000 D11..D8``, ``D7..D0``, repeated."""
         return _words(self._converter.convert(length, line), length)
 
 
 class Adc121c021:
-    """Eight registers behind a pointer; reading the conversion register converts."""
+    """The ADC121C021, with eight registers behind a pointer; a read of the conversion register converts."""
 
     acknowledges_data = True
     _SIZES: Final = (2, 1, 1, 2, 2, 2, 2, 2)
@@ -113,7 +114,7 @@ class Adc121c021:
     _READ_ONLY: Final = (0,)
 
     def __init__(self, source: SampleSource) -> None:
-        self._converter = _Successive(source)
+        self._converter = _SarConverter(source)
         self.power_on(0.0)
 
     def power_on(self, t_mono: float) -> None:
@@ -129,8 +130,8 @@ class Adc121c021:
         if len(data) > size and self.pointer not in self._READ_ONLY:
             self.registers[self.pointer] = int.from_bytes(data[1 : 1 + size], "big")
 
-    def read(self, length: int, line: Line) -> bytes:
-        """The register pointed at, again and again; conversions if it is theirs."""
+    def read(self, length: int, line: SclTiming) -> bytes:
+        """The selected register, repeated; conversions where it is the conversion register."""
         if self.pointer:
             size = self._SIZES[self.pointer]
             value = self.registers[self.pointer].to_bytes(size, "big")
@@ -146,10 +147,10 @@ class Adc121c021:
 
 
 class Ads1x15:
-    """A delta-sigma converter with an oscillator of its own.
+    """An ADS1015 or ADS1115: a delta-sigma converter with an oscillator of its own.
 
     Args:
-        source: as a fraction of the supply, of ``supply_v``. bits: 16 for an ADS1115, 12 for an ADS1015.
+        source: fractions of the supply ``supply_v``. bits: 16 for an ADS1115, 12 for an ADS1015.
         oscillator: relative error of its data rate, up to 0.1.
     """
 
@@ -184,8 +185,8 @@ class Ads1x15:
         elif self.pointer == 3:
             self.high = value
 
-    def read(self, length: int, line: Line) -> bytes:
-        """The register pointed at, again and again."""
+    def read(self, length: int, line: SclTiming) -> bytes:
+        """The selected register, repeated."""
         value = (self._result(line.t_start), self._state(line.t_start), self.low, self.high)[self.pointer]
         return (struct.pack(">H", value) * (length // 2 + 1))[:length]
 
@@ -205,7 +206,7 @@ class Ads1x15:
         return (self.config & 0x7FFF) | (0 if converting else 0x8000)
 
     def _result(self, t_mono: float) -> int:
-        """What the conversion register holds: the latest conversion that is complete."""
+        """Content of the conversion register: the latest complete conversion."""
         if t_mono < self._ready:
             return self._held
         period = self._period()
@@ -217,7 +218,7 @@ class Ads1x15:
 
 
 class _Registers:
-    """A chip that keeps values and does nothing."""
+    """A chip with registers and no function."""
 
     acknowledges_data = True
 
@@ -233,7 +234,7 @@ class _Registers:
         if len(data) > 1:
             self.values[self.pointer] = data[1:]
 
-    def read(self, length: int, line: Line) -> bytes:
+    def read(self, length: int, line: SclTiming) -> bytes:
         value = self.values.get(self.pointer, b"\xff")
         return (value * length)[:length]
 

@@ -1,7 +1,7 @@
-"""A photodiode's converter without the photodiode: chips on a simulated bus, orderable faults, an injected clock.
+"""The fake light receiver: a converter and an optional DC channel on a simulated bus, with fault injection.
 
-The light comes from a :data:`hal.fake.adc.chips.SampleSource`, which a simulator supplies. The same object is a memory
-bus under virtual time and, behind :class:`hal.bus.i2c_server.BusServer`, a bus of this computer in real time.
+A :data:`hal.fake.adc.chips.SampleSource` of a simulator supplies the light. The same object is a memory bus under
+virtual time and, behind :class:`hal.bus.i2c_server.BusServer`, a bus of this computer in real time.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from hal.fake.adc.faults import ADC
 from hal.fake.adc.i2c_adapters import BCM2835, Adapter
 from hal.fake.adc.i2c_bus import FakeBus, Transaction
 from hal.fake.adc.i2c_timing import Times
-from hal.fake.faults import Fault, FaultError, Vocabulary
-from hal.fake.schedule import Orders
+from hal.fake.faults.orders import Fault, FaultError, Vocabulary
+from hal.fake.faults.schedule import ActiveFaults
 
 MIDDLE: Final = 0.5
-"""What an AC-coupled input rests at."""
+"""Rest level of an AC-coupled input, as a fraction of the supply."""
 OWN_NOISE: Final = 1.1e-4
-"""One sigma of amplifier and converter without any light, as a fraction of the supply: 0.45 words of 12 bits."""
+"""Noise of amplifier and converter without light, one sigma as a fraction of the supply: 0.45 words of 12 bits."""
 
 CHIPS: Final[dict[str, Callable[[SampleSource], FakeChip]]] = {
     "MCP3221": Mcp3221,
@@ -40,12 +40,12 @@ CHIPS: Final[dict[str, Callable[[SampleSource], FakeChip]]] = {
 
 
 class FakeAdc:
-    """One bus with one converter, and a DC channel if there is one; a :class:`hal.fake.schedule.Target`.
+    """One bus with one converter and an optional DC channel; a :class:`hal.fake.faults.schedule.Target`.
 
     Args:
         source: the signal at the converter. clock: the loop's.
-        chip: of the converter, a key of :data:`CHIPS`. address: where it is.
-        adapter: how the host drives the bus. seed: of jitter and of faults left to chance.
+        chip: of the converter, a key of :data:`CHIPS`. address: of the converter.
+        adapter: of the host. seed: of jitter and of random faults.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class FakeAdc:
         self._arrange()
 
     def add_level(self, source: SampleSource, address: int = 0x48, chip: str = "ADS1115") -> None:
-        """A DC channel: ``source`` is the amplifier's output before the coupling capacitor."""
+        """Add a DC channel: ``source`` is the amplifier's output before the coupling capacitor."""
 
         def level(t_mono: Times) -> npt.NDArray[np.float64]:
             if self.orders.on("dark"):
@@ -79,24 +79,24 @@ class FakeAdc:
         self._arrange()
 
     @property
-    def orders(self) -> Orders:
-        """The faults in force, and how often each word has struck."""
+    def orders(self) -> ActiveFaults:
+        """The faults in force, and the number of strikes of each word."""
         return self.bus.orders
 
     @property
     def vocabulary(self) -> Vocabulary:
-        """The words in which faults are ordered."""
+        """The words of its fault orders."""
         return ADC
 
     def in_force(self) -> list[Fault]:
-        """Faults that have not been lifted and have not spent their strikes."""
+        """Faults neither lifted nor used up."""
         return self.orders.in_force()
 
     def check(self, fault: Fault) -> None:
-        """Refuse an order that makes no sense here.
+        """Refuse an order that this receiver cannot carry out.
 
         Raises:
-            FaultError: ``dc_off`` without a DC channel, ``moved`` to where another chip is.
+            FaultError: ``dc_off`` without a DC channel, ``moved`` to the address of another chip.
         """
         if fault.what == "dc_off" and self._dc is None:
             raise FaultError("dc_off", "this receiver has no DC channel")
@@ -126,7 +126,7 @@ class FakeAdc:
             chip.power_on(self._clock.now())
 
     def _arrange(self) -> None:
-        """Put the chips where they answer now."""
+        """Set the chips at their present addresses."""
         moved, replaced = self.orders.on("moved"), self.orders.on("replaced")
         chip = CHIPS[replaced.text("chip")](self._signal) if replaced else self._chip
         where = int(moved.number("address")) if moved else self.address
@@ -136,7 +136,7 @@ class FakeAdc:
             self.bus.chips[self._dc[0]] = self._dc[1]
 
     def _signal(self, t_mono: Times) -> npt.NDArray[np.float64]:
-        """The light as the faults in force leave it."""
+        """The input signal, altered by the faults in force."""
         if self.orders.on("dark") or self.orders.on("saturated"):
             return MIDDLE + OWN_NOISE * self._noise.standard_normal(t_mono.size)
         fraction = self._source(t_mono)
@@ -148,7 +148,7 @@ class FakeAdc:
 
 
 class _Handle:
-    """A memory bus as one opening of it: dead for good once the adapter has been unplugged."""
+    """One open handle of a memory bus: dead once the adapter has been unplugged."""
 
     def __init__(self, device: FakeAdc) -> None:
         self._device, self._unplugged = device, device.unplugged
@@ -181,7 +181,7 @@ class FakeBuses:
         """Open a bus.
 
         Raises:
-            DeviceMissing: none of that name, or its adapter is unplugged. DeviceRefused: so ordered.
+            DeviceMissing: no bus of that name, or its adapter is unplugged. DeviceRefused: by a fault order.
         """
         device = self._devices.get(name)
         if device is None or device.orders.on("gone"):

@@ -1,11 +1,11 @@
-"""Damage to the bytes of a block."""
+"""Damages the bytes of a sample block. Pure functions of the bytes, the fault and a random source."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from random import Random
 
-from hal.fake.faults import Fault
+from hal.fake.faults.orders import Fault
 
 Harm = Callable[[bytes, Fault, Random], bytes]
 
@@ -38,7 +38,7 @@ def _floats(data: bytes, _fault: Fault, _random: Random) -> bytes:
 
 
 def _shift(data: bytes, fault: Fault, _random: Random) -> bytes:
-    """The host's bit counter is ahead of the chip's; the bits that are missing at the end read 1."""
+    """Shift the bits, as after lost clocks; the missing bits at the end read 1."""
     bits = int(fault.number("bits"))
     number = (int.from_bytes(data, "big") << bits) | ((1 << bits) - 1)
     return (number & ((1 << 8 * len(data)) - 1)).to_bytes(len(data), "big")

@@ -1,10 +1,10 @@
-"""The words in which faults of a photodiode's converter, its bus and its light are ordered."""
+"""The vocabulary of faults of the fake light receiver: converter, bus, light."""
 
 from __future__ import annotations
 
 import errno
 
-from hal.fake.faults import Parameter, Vocabulary, Word
+from hal.fake.faults.orders import Parameter, Vocabulary, Word
 
 ERRORS = (
     *("EIO", "ENXIO", "EREMOTEIO", "ETIMEDOUT", "EAGAIN", "EBUSY", "EOPNOTSUPP", "EINVAL"),
@@ -59,7 +59,7 @@ ADC: Vocabulary = {
     "dark": Word("no light: only the electronics' own noise", "lasts"),
     "saturated": Word("so much light that the amplifier stands at its limit", "lasts"),
 }
-"""By word. ``off stuck garbage wrong slow delayed intermittent`` mean what they mean for any device."""
+"""By word. ``off stuck garbage wrong slow delayed intermittent`` are common to all devices."""
 
 
 def number_of(name: str) -> int:

@@ -1,6 +1,6 @@
-"""I2C adapters as Linux drives them: what they can do, how they fail, and how long they take around a transaction.
+"""Properties of I2C adapters under Linux: limits, errnos, overheads and pauses of a transaction.
 
-What no document at hand states is marked *assumed*. Overheads differ from host to host; these are of the right order.
+Overheads differ between hosts; these are of the right order.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ class Adapter:
     """One adapter.
 
     Attributes:
-        name: what it calls itself. scl_hz: SCL it is set to. nack: errno of a missing acknowledgement.
-        any_error: errno that stands for every failure of a transfer, 0: each has its own.
+        name: its own name. scl_hz: configured SCL. nack: errno of a missing acknowledgement.
+        any_error: errno of every failed transfer, 0: each failure has its own.
         max_read, max_write, max_messages: beyond them EOPNOTSUPP. one_read_last: a read must be the only one, and last.
-        chunk: bytes after which SCL rests for chunk_pause_s while the adapter fetches more; 0: never.
-        timeout_s: a transaction that takes longer fails. lame_after_timeout: and so does the one that follows.
+        chunk: bytes after which SCL pauses for chunk_pause_s; 0: never.
+        timeout_s: a longer transaction fails. fails_after_timeout: the next one fails as well.
         start_s, end_s: from the call to START, from STOP to the return. jitter_s: mean of an exponential part of each.
-        preempt_s: mean time SCL rests when a bit-banging processor is interrupted, every preempt_every_s on average.
+        preempt_s: mean pause of SCL when a bit-banging processor is interrupted, every preempt_every_s on average.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Adapter:
     chunk: int = 0
     chunk_pause_s: float = 0.0
     timeout_s: float = 1.0
-    lame_after_timeout: bool = False
+    fails_after_timeout: bool = False
     start_s: float = 40e-6
     end_s: float = 25e-6
     jitter_s: float = 3e-6
@@ -43,7 +43,7 @@ class Adapter:
     preempt_every_s: float = 0.0
 
 
-BCM2835: Final = Adapter("bcm2835 (i2c@7e804000)", nack=errno.EREMOTEIO, one_read_last=True, lame_after_timeout=True)
+BCM2835: Final = Adapter("bcm2835 (i2c@7e804000)", nack=errno.EREMOTEIO, one_read_last=True, fails_after_timeout=True)
 """Raspberry Pi 1 to 4."""
 DESIGNWARE: Final = Adapter("Synopsys DesignWare I2C adapter", nack=errno.EREMOTEIO)
 """Raspberry Pi 5 (RP1) and many others."""

@@ -1,7 +1,7 @@
-"""A simulated bus at the level of messages: addresses, acknowledgements, SCL in time, and an adapter with its limits.
+"""A simulated I2C bus at message level: addresses, acknowledgements, SCL timing, limits of the adapter, faults.
 
-It is a memory bus (:class:`hal.bus.i2c_memory.MemoryBus`): a transaction is begun, its end is known at once, and its
-bytes are made when that time has come. It knows the faults in force; the converter they are about is at ``address``.
+It is a memory bus (:class:`hal.bus.i2c_memory.MemoryBus`): the end time of a transaction is known at its beginning, its
+bytes are computed at that time.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from hal.fake.adc.chips import FakeChip
 from hal.fake.adc.damage import DAMAGE
 from hal.fake.adc.faults import number_of
 from hal.fake.adc.i2c_adapters import Adapter
-from hal.fake.adc.i2c_timing import Line
-from hal.fake.faults import Fault
-from hal.fake.schedule import Orders
+from hal.fake.adc.i2c_timing import SclTiming
+from hal.fake.faults.orders import Fault
+from hal.fake.faults.schedule import ActiveFaults
 
 BLOCK: int = 60
-"""Bytes of a read from which on it counts as a block."""
+"""A read of at least this many bytes counts as a block."""
 REFUSED_S = 10e-6
-"""An error that never reaches the bus."""
+"""Duration of a transaction that is refused before it reaches the bus."""
 AROUND = 10
 """Clocks of START, address with acknowledgement, and STOP."""
 
 
 @dataclass(slots=True)
 class Transaction:
-    """One that has begun; see :class:`hal.bus.i2c_memory.Pending`.
+    """A transaction in progress; see :class:`hal.bus.i2c_memory.Pending`.
 
     Attributes:
         t0, t_end: ``t_mono`` of call and return. code: errno it fails with, 0: none.
-        lines: SCL of each message. is_block: it reads from the converter, and much.
+        lines: SCL timing of each message. is_block: it reads a block from the converter.
     """
 
     bus: FakeBus
@@ -43,7 +43,7 @@ class Transaction:
     t0: float
     t_end: float
     code: int = 0
-    lines: list[Line] = field(default_factory=list)
+    lines: list[SclTiming] = field(default_factory=list)
     is_block: bool = False
 
     def finish(self) -> Transferred:
@@ -58,7 +58,7 @@ class FakeBus:
     """One bus, its adapter, and the chips on it.
 
     Args:
-        adapter: how the host drives it. now: the clock. seed: of jitter and of faults left to chance.
+        adapter: of the host. now: the clock. seed: of jitter and of random faults.
         scl_error: relative error of SCL.
     """
 
@@ -67,23 +67,23 @@ class FakeBus:
         self.scl_error = scl_error
         self.chips: dict[int, FakeChip] = {}
         self.converter = 0
-        self.orders = Orders(seed + 1)
+        self.orders = ActiveFaults(seed + 1)
         self.chance = Random(seed)
         self.transactions = 0
         self._free_at = float("-inf")
-        self._lame = False
+        self._fails_next = False
 
     @property
     def about(self) -> str:
-        """What the adapter calls itself."""
+        """The adapter's own name."""
         return self.adapter.name
 
     def begin(self, messages: tuple[Message, ...], *, dead: bool = False) -> Transaction:
-        """Begin one transaction now; it waits until the one before it is over.
+        """Begin one transaction now; it waits for the end of the one before.
 
         Args:
             messages: joined by repeated starts.
-            dead: the caller's handle is one of an adapter that has been unplugged.
+            dead: the caller's handle belongs to an unplugged adapter.
         """
         self.transactions += 1
         t0 = self.now()
@@ -100,7 +100,7 @@ class FakeBus:
         return begun
 
     def transfer(self, messages: tuple[Message, ...]) -> Transferred:
-        """The whole of it at once, with an end in the future of the clock; see :class:`hal.bus.i2c.Bus`."""
+        """Carry out one transaction at once, with an end in the future of the clock; see :class:`hal.bus.i2c.Bus`."""
         return self.begin(messages).finish()
 
     def gone(self) -> int:
@@ -108,7 +108,7 @@ class FakeBus:
         return errno.ENODEV if self.orders.on("gone") else 0
 
     def carry_out(self, done: Transaction) -> tuple[bytes, ...]:
-        """Let the chips act, now that the time of the transaction is over."""
+        """Let the chips act, at the end time of the transaction."""
         reads: list[bytes] = []
         for message, line in zip(done.messages, done.lines, strict=True):
             chip = self.chips.get(message.address)
@@ -116,15 +116,15 @@ class FakeBus:
                 if chip is not None:
                     chip.write(message.data, line.t_start)
                 continue
-            released = b"\xff" * message.length  # the chip has gone in the middle
+            released = b"\xff" * message.length  # the chip was removed meanwhile
             data = released if chip is None else chip.read(message.length, line)
             reads.append(self._damaged(data) if done.is_block and message.length >= BLOCK else data)
         return tuple(reads)
 
-    # how it goes
+    # messages
 
     def _refusal(self, messages: tuple[Message, ...]) -> int:
-        """Errno of what the kernel or the adapter's driver would not even begin."""
+        """Errno with which the kernel or the adapter's driver refuses the messages; 0: none."""
         try:
             check(messages)
         except OSError as error:
@@ -135,20 +135,20 @@ class FakeBus:
         layout = adapter.one_read_last and (len(reads) > 1 or (bool(reads) and not messages[-1].length))
         if too_long or layout or len(messages) > adapter.max_messages:
             return errno.EOPNOTSUPP
-        if self._lame:
-            self._lame = False
+        if self._fails_next:
+            self._fails_next = False
             return errno.ETIMEDOUT
         return 0
 
     def _walk(self, begun: Transaction, t_bus: float) -> float:
-        """Go through the messages; sets what the transaction fails with, returns the time of STOP."""
+        """Process the messages: set the errno of a failure, return the time of STOP."""
         scl_hz = self._scl_hz()
         fails = self._disturbance(begun)
         t = t_bus
         for message in begun.messages:
             length = len(message.data) or message.length
             stalls = self._stalls(length, is_block=begun.is_block and message.length >= BLOCK)
-            line = Line(t, scl_hz, stalls)
+            line = SclTiming(t, scl_hz, stalls)
             begun.lines.append(line)
             if fails == errno.ETIMEDOUT:
                 return self._time_out(begun, t_bus)
@@ -165,7 +165,7 @@ class FakeBus:
         return t
 
     def _acknowledged(self, message: Message) -> int:
-        """Bytes of a message that are acknowledged, -1 if not even the address is. The host acknowledges reads."""
+        """Acknowledged bytes of a message, -1 where the address is not. The host acknowledges reads."""
         chip = self.chips.get(message.address)
         if chip is None:
             return -1
@@ -178,11 +178,11 @@ class FakeBus:
 
     def _time_out(self, begun: Transaction, t_bus: float) -> float:
         begun.code = self._own(errno.ETIMEDOUT)
-        self._lame = self.adapter.lame_after_timeout
+        self._fails_next = self.adapter.fails_after_timeout
         return t_bus + self.adapter.timeout_s
 
     def _disturbance(self, begun: Transaction) -> int:
-        """Errno of a fault that strikes this transaction."""
+        """Errno of a fault that strikes this transaction; 0: none."""
         orders = self.orders
         if orders.on("hang"):
             return errno.ETIMEDOUT
@@ -219,7 +219,7 @@ class FakeBus:
         return (delayed.number("by_s") if delayed else 0.0) + (late.number("by_s") if late else 0.0)
 
     def _stalls(self, length: int, is_block: bool) -> tuple[tuple[float, float], ...]:
-        """Where SCL is held low, always between two bytes."""
+        """Stalls of SCL (clock, seconds), always between two bytes."""
         adapter, chance = self.adapter, self.chance
         found: list[tuple[float, float]] = []
         if adapter.chunk:

@@ -1,4 +1,4 @@
-"""SCL in time: when the n-th clock of a message falls, with whatever holds the clock up."""
+"""SCL timing of a message: the time of its n-th clock, with stalls."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ Times = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class SclTiming:
     """The clocks of one message.
 
     Attributes:
-        t_start: ``t_mono`` of START. scl_hz: clocks per second while nothing holds them up.
+        t_start: ``t_mono`` of START. scl_hz: clocks per second without stalls.
         stalls: (clock, seconds) at which SCL is held low.
     """
 

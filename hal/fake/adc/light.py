@@ -1,4 +1,4 @@
-"""Light for a fake converter where no simulator supplies it: ordinary lamps, or a recorded signal."""
+"""Light sources for the fake converter: ordinary mains lamps, or a recorded signal."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from hal.errors import DataInvalid
 from hal.fake.adc.i2c_timing import Times
 
 MIDDLE: Final = 0.5
-"""What an AC-coupled input rests at."""
+"""Rest level of an AC-coupled input, as a fraction of full scale."""
 Fractions = npt.NDArray[np.float64]
 
 
 class OrdinaryLamps:
-    """A room whose lamps flicker with the mains and say nothing.
+    """Lamps without codes that flicker with the mains.
 
     Args:
         mains_hz: the lamps flicker at twice that. swing: amplitude, as a fraction of full scale.
@@ -36,13 +36,13 @@ class OrdinaryLamps:
 
 
 class RecordedLight:
-    """A signal from a file, again and again from its beginning.
+    """A signal from a file, repeated from its beginning.
 
     Args:
         path: an ``.npz`` file with ``fraction`` (of full scale, evenly spaced) and ``rate_hz``.
 
     Raises:
-        DataInvalid: not such a file.
+        DataInvalid: not a file of that kind.
     """
 
     def __init__(self, path: Path) -> None:
@@ -60,7 +60,7 @@ class RecordedLight:
         self._count = fraction.size
 
     def __call__(self, t_mono: Times) -> Fractions:
-        """See :data:`hal.fake.adc.chips.SampleSource`; between its samples the signal is a straight line."""
+        """See :data:`hal.fake.adc.chips.SampleSource`; linear interpolation between the samples."""
         at = np.mod(t_mono * self._rate_hz, self._count)
         below = at.astype(np.int64) % self._count
         part = at - np.floor(at)

@@ -1,4 +1,4 @@
-"""A simulated light receiver on a bus of its own, to try the daemon without one.
+"""Command: a simulated light receiver on a bus of its own, to try the daemon without hardware.
 
 ::
 
@@ -25,15 +25,15 @@ from hal.fake.adc.chips import SampleSource
 from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.i2c_adapters import ADAPTERS
 from hal.fake.adc.light import OrdinaryLamps, RecordedLight
-from hal.fake.control import Control, serve_control
-from hal.fake.faults import FaultError
-from hal.fake.schedule import FaultSchedule
-from hal.run_server import say, until_told
+from hal.fake.faults.control import Control, serve_control
+from hal.fake.faults.orders import FaultError
+from hal.fake.faults.schedule import FaultSchedule
+from hal.run_server import print_line, until_stopped
 
 BUS = "simulated"
 DC_ADDRESS = 0x48
 DC_REST = 0.1 / 3.3
-"""What the amplifier's output is at without any light, of the supply."""
+"""Output of the amplifier without light, as a fraction of the supply."""
 
 
 @dataclass(slots=True)
@@ -108,18 +108,18 @@ async def _serve(options: _Options) -> None:
     try:
         if options.faults is not None:
             faults = schedule.load(options.faults.read_text(encoding="utf-8"))
-            say(f"{len(faults)} faults of {options.faults} ordered")
-        say(f"{options.chip} at {options.address:#04x} on {await server.listen(options.where)}")
+            print_line(f"{len(faults)} faults of {options.faults} ordered")
+        print_line(f"{options.chip} at {options.address:#04x} on {await server.listen(options.where)}")
         if options.control is not None:
             control = await serve_control(Control(schedule), options.control)
-            say(f"fault orders on {options.control}")
-        await until_told(options.seconds)
+            print_line(f"fault orders on {options.control}")
+        await until_stopped(options.seconds)
     finally:
         schedule.close()
         if control is not None:
             control.close()
         await server.close()
-    say(f"{device.bus.transactions} transactions")
+    print_line(f"{device.bus.transactions} transactions")
 
 
 def main(arguments: list[str] | None = None) -> int:

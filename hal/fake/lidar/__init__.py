@@ -1,1 +1,1 @@
-"""A wire-true fake HOKUYO lidar with orderable faults."""
+"""A simulated HOKUYO lidar that matches SCIP byte for byte, with fault injection."""

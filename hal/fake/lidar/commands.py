@@ -1,4 +1,4 @@
-"""What a sensor makes of a line from the host: a request, or the status with which it refuses it (C-42-03320B)."""
+"""The sensor's parser of SCIP commands: a request, or the status of its refusal (C-42-03320B)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PARAMETERS = {
     "VV": 0, "PP": 0, "II": 0, "BM": 0, "QT": 0, "RS": 0, "RT": 0, "RB": 0,
     "TM": 1, "SS": 6, "CR": 2, "HS": 1, "%ST": 0, "%SL": 0,
 }  # fmt: skip
-"""Parameter characters of each command beside the measurements; the ``%`` commands are SCIP 2.2."""
+"""Parameter characters of each command other than measurements; the ``%`` commands are SCIP 2.2."""
 
 STREAM_PARAMETERS = 13
 SINGLE_PARAMETERS = 10
@@ -25,7 +25,7 @@ LINE_ENDS = re.compile(rb"[\r\n]")
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A command that can be understood. ``echo`` is the line as it came, tag included; ``tag`` begins with ``;``."""
+    """A valid command. ``echo`` is the received line with its tag; ``tag`` begins with ``;``."""
 
     echo: bytes
     name: str
@@ -35,7 +35,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A line that is answered with ``status`` in every state."""
+    """An invalid line, answered with ``status`` in every state."""
 
     echo: bytes
     status: str
@@ -53,12 +53,12 @@ class Measure:
 
 
 def letters(line: bytes) -> str:
-    """The command's own characters: two, or three where they begin with ``%``."""
+    """The command's name: two characters, or three beginning with ``%``."""
     return line[: 3 if line.startswith(b"%") else 2].decode("ascii", errors="replace")
 
 
-def known(name: str, model: LidarModel) -> int | None:
-    """Parameter characters of a command of this model; None: unknown to it."""
+def parameter_count(name: str, model: LidarModel) -> int | None:
+    """Number of parameter characters of a command; None where the model does not have it."""
     if name in model.measures:
         return STREAM_PARAMETERS if name in STREAMS else SINGLE_PARAMETERS
     if name.startswith("%") and model.profile != "2.2":
@@ -67,10 +67,10 @@ def known(name: str, model: LidarModel) -> int | None:
 
 
 def parse(line: bytes, model: LidarModel) -> Request | Refusal:
-    """Understand a line without its end."""
+    """Parse a line without its end."""
     body, mark, tag = line.partition(b";")
     name = letters(body)
-    wanted = known(name, model)
+    wanted = parameter_count(name, model)
     if wanted is None:
         return Refusal(line, "0E")
     parameters = body[len(name) :]
@@ -86,7 +86,7 @@ def parse(line: bytes, model: LidarModel) -> Request | Refusal:
 
 
 def measure(request: Request, model: LidarModel) -> Measure | str:
-    """Read the parameters of a measurement; a ``str`` is the status with which they are refused."""
+    """Parse the parameters of a measurement; a ``str`` is the status of their refusal."""
     text = request.parameters
     fields = {"01": text[0:4], "02": text[4:8], "03": text[8:10]}
     if request.name in STREAMS:

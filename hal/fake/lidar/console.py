@@ -1,4 +1,4 @@
-"""The command side of a fake sensor: lines from the host, one after the other, and their replies."""
+"""The command interpreter of the fake sensor: lines from the host in order, and their replies."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Callable
 
 from hal.fake.lidar import info_replies, scip_encoder
 from hal.fake.lidar.commands import LINE_ENDS, SINGLES, STREAMS, Refusal, Request, letters, measure, parse
-from hal.fake.lidar.device_state import Core
-from hal.fake.lidar.dialect_grid import State, answer
-from hal.fake.lidar.measuring_head import Head
+from hal.fake.lidar.device_state import DeviceState
+from hal.fake.lidar.dialect_grid import State, response
+from hal.fake.lidar.measuring_head import MeasuringHead
 
 MAX_LINE = 256
-"""Characters of a command line; what goes beyond is thrown away up to the line's end."""
+"""Characters of a command line; further ones are dropped up to the line's end."""
 MAX_WAITING = 32
-"""Lines that wait for their turn; further ones are lost, as in a full input buffer."""
+"""Queued lines; further ones are lost, as in a full input buffer."""
 REBOOT_PAIR_S = 1.0
 """Two RB must come within this time; the reboot follows this long after the second."""
 BAUD_CHANGE_S = 0.01
@@ -26,19 +26,19 @@ class Console:
     """Reads commands and answers them in order, each after the sensor's latency.
 
     Args:
-        core: the sensor's body. head: its measuring head. reboot: called when RB takes effect.
+        device: the sensor's shared state. head: its measuring head. reboot: called when RB takes effect.
     """
 
-    def __init__(self, core: Core, head: Head, reboot: Callable[[], None]) -> None:
-        self._core, self._head, self._reboot = core, head, reboot
+    def __init__(self, device: DeviceState, head: MeasuringHead, reboot: Callable[[], None]) -> None:
+        self._device, self._head, self._reboot = device, head, reboot
         self._text = bytearray()
         self._lines: deque[bytes] = deque()
         self._busy = False
         self._last_rb = float("-inf")
         self._sensitivity = b"0"
-        core.alien = lambda name: scip_encoder.reply(name.encode("ascii"), "00", self._text_body(name))
+        device.foreign = lambda name: scip_encoder.reply(name.encode("ascii"), "00", self._text_body(name))
         self._handlers: dict[str, Callable[[Request], None]] = {
-            "VV": self._ask, "PP": self._ask, "II": self._ask, "%ST": self._ask, "TM": self._time,
+            "VV": self._info, "PP": self._info, "II": self._info, "%ST": self._info, "TM": self._time,
             "BM": self._laser_on, "QT": self._quit, "RS": self._reset, "RT": self._reset, "RB": self._restart,
             "SS": self._set_baud, "CR": self._set_speed, "HS": self._set_sensitivity, "%SL": self._sleep,
             **dict.fromkeys(STREAMS, self._start_stream),
@@ -46,8 +46,8 @@ class Console:
         }  # fmt: skip
 
     def receive(self, data: bytes) -> None:
-        """Bytes from the host; noise when the host talks at another rate."""
-        if not self._core.at_same_rate():
+        """Process bytes from the host; bytes at another line rate are dropped."""
+        if not self._device.at_same_rate():
             return
         self._text += data
         *whole, rest = LINE_ENDS.split(bytes(self._text))
@@ -56,28 +56,28 @@ class Console:
         self._lines.extend(lines[: MAX_WAITING - len(self._lines)])
         self._next()
 
-    def forget(self) -> None:
-        """Drop half a line and everything that waits (power off, host gone)."""
+    def reset(self) -> None:
+        """Drop the incomplete line and all queued ones (power off, host gone)."""
         self._text.clear()
         self._lines.clear()
         self._busy = False
         for name in ("command", "single", "reset"):
-            self._core.cancel(name)
+            self._device.cancel(name)
 
     def _next(self) -> None:
         if self._busy or not self._lines:
             return
         self._busy = True
-        core = self._core
-        due = core.now() + core.model.latency_s + abs(core.chance.gauss(0.0, core.model.jitter_s))
-        core.at("command", core.clock.next_tick(due, core.model.tick_s), self._execute)
+        device = self._device
+        due = device.now() + device.model.latency_s + abs(device.chance.gauss(0.0, device.model.jitter_s))
+        device.at("command", device.clock.next_tick(due, device.model.tick_s), self._execute)
 
     def _execute(self) -> None:
         line = self._lines.popleft()
-        repeated = line != b"RB" and line in self._lines and self._core.state is not State.SCIP1
+        repeated = line != b"RB" and line in self._lines and self._device.state is not State.SCIP1
         if repeated:
             self._lines = deque(other for other in self._lines if other != line)
-        self._obey(line)
+        self._dispatch(line)
         if repeated:
             self._reply(line, "0B")
 
@@ -86,84 +86,84 @@ class Console:
         self._next()
 
     def _reply(self, echo: bytes, status: str, body: bytes = b"") -> None:
-        """Answer the command in hand and turn to the next."""
-        lost = self._core.orders.strike("no_reply", command=letters(echo))
+        """Answer the current command and start the next."""
+        lost = self._device.orders.strike("no_reply", command=letters(echo))
         if not lost:
-            self._core.send(scip_encoder.reply(echo, status, body))
+            self._device.send(scip_encoder.reply(echo, status, body))
         self._done()
 
-    def _obey(self, line: bytes) -> None:
-        core = self._core
-        if core.orders.strike("ignore", command=letters(line)):
+    def _dispatch(self, line: bytes) -> None:
+        device = self._device
+        if device.orders.strike("ignore", command=letters(line)):
             return self._done()
-        if core.state is State.SCIP1:
+        if device.state is State.SCIP1:
             return self._scip1(line)
-        request = parse(line, core.model)
+        request = parse(line, device.model)
         if isinstance(request, Refusal):
             return self._reply(line, request.status)
-        cell = answer(core.model.profile, core.state, request.name, request.parameters)
+        cell = response(device.model.profile, device.state, request.name, request.parameters)
         if cell == "--":
             return self._done()
         return self._handlers[request.name](request) if cell == "do" else self._reply(line, cell)
 
     def _scip1(self, line: bytes) -> None:
-        core = self._core
+        device = self._device
         if line == b"SCIP2.0":
-            core.state = State.IDLE
-            core.send(b"SCIP2.0\n0\n\n")
+            device.state = State.IDLE
+            device.send(b"SCIP2.0\n0\n\n")
         elif line == b"V":
-            core.send(b"V\n0\n" + info_replies.scip1(core.model, core.unit) + b"\n")
+            device.send(b"V\n0\n" + info_replies.scip1(device.model, device.unit) + b"\n")
         else:
-            core.send(line + b"\nE\n\n")
+            device.send(line + b"\nE\n\n")
         self._done()
 
-    def _ask(self, request: Request) -> None:
+    def _info(self, request: Request) -> None:
         self._reply(request.echo, "00", self._text_body(request.name))
 
     def _text_body(self, name: str) -> bytes:
-        core = self._core
-        variant = core.orders.on("text_sum")
+        device = self._device
+        variant = device.orders.on("text_sum")
         line = scip_encoder.TEXT_SUMS[variant.text("variant") if variant else "plain"]
         if name == "%ST":
-            return scip_encoder.summed_line(core.state.value.encode("ascii"))
+            return scip_encoder.summed_line(device.state.value.encode("ascii"))
         if name == "VV":
-            pairs = info_replies.identity(core.model, core.unit, ";beta" if core.orders.on("semicolon") else "")
+            pairs = info_replies.identity(device.model, device.unit, ";beta" if device.orders.on("semicolon") else "")
         elif name == "PP":
-            fault = core.orders.on("dmax")
-            pairs = info_replies.parameters(core.model, int(fault.number("value")) if fault else core.model.dmax)
+            fault = device.orders.on("dmax")
+            pairs = info_replies.parameters(device.model, int(fault.number("value")) if fault else device.model.dmax)
         else:
-            pairs = info_replies.state(core.model, self._live())
+            pairs = info_replies.state(device.model, self._live())
         return info_replies.lines(pairs, line)
 
-    def _live(self) -> info_replies.Live:
-        core = self._core
-        fault = core.orders.on("trouble")
-        trouble = fault.text("text") if fault else core.trouble
-        return info_replies.Live(core.state, core.laser, core.baud, core.clock.tick(core.now()), trouble)
+    def _live(self) -> info_replies.LiveState:
+        device = self._device
+        fault = device.orders.on("trouble")
+        trouble = fault.text("text") if fault else device.trouble
+        return info_replies.LiveState(device.state, device.laser, device.baud, device.clock.tick(device.now()), trouble)
 
     def _time(self, request: Request) -> None:
-        core = self._core
+        device = self._device
         if request.parameters == b"0":
             self._stop(State.TIME_ADJUST)
         elif request.parameters == b"2":
-            core.state = State.IDLE
-        elif core.state is not State.TIME_ADJUST and core.unit.strict_time:
+            device.state = State.IDLE
+        elif device.state is not State.TIME_ADJUST and device.unit.strict_time:
             return self._reply(request.echo, "04")
         else:
-            stamp = scip_encoder.number(core.clock.tick(core.now()), 4)
+            stamp = scip_encoder.number(device.clock.tick(device.now()), 4)
             return self._reply(request.echo, "00", scip_encoder.summed_line(stamp))
         return self._reply(request.echo, "00")
 
     def _stop(self, state: State) -> None:
         self._head.halt()
-        self._core.dark(state)
+        self._device.laser_off(state)
 
     def _laser_on(self, request: Request) -> None:
-        self._core.light(State.SINGLE)
+        self._device.laser_on(State.SINGLE)
         self._reply(request.echo, "00")
 
     def _quit(self, request: Request) -> None:
-        if self._core.state not in (State.BOOTING, State.TIME_ADJUST):
+        if self._device.state not in (State.BOOTING, State.TIME_ADJUST):
             self._stop(State.IDLE)
         self._reply(request.echo, "00")
 
@@ -172,61 +172,61 @@ class Console:
         self._reply(request.echo, "00")
 
     def _start_stream(self, request: Request) -> None:
-        wanted = measure(request, self._core.model)
+        wanted = measure(request, self._device.model)
         if isinstance(wanted, str):
             return self._reply(request.echo, wanted)
         self._head.halt()
-        self._core.light(State.MULTI)
+        self._device.laser_on(State.MULTI)
         self._head.stream(request, wanted)
         return self._reply(request.echo, "00")
 
     def _get_one(self, request: Request) -> None:
-        wanted = measure(request, self._core.model)
+        wanted = measure(request, self._device.model)
         if isinstance(wanted, str):
             return self._reply(request.echo, wanted)
         return self._head.once(request, wanted, self._done)
 
     def _reset(self, request: Request) -> None:
-        core = self._core
-        if core.state is not State.BOOTING:
+        device = self._device
+        if device.state is not State.BOOTING:
             self._stop(State.IDLE)
 
         def complete() -> None:
-            core.clock.set(core.now())
+            device.clock.set(device.now())
             self._reply(request.echo, "00")
             if request.name == "RS":
                 self._head.turn(slower_percent=0)
                 self._sensitivity = b"0"
-                core.at("baud", core.now() + BAUD_CHANGE_S, lambda: core.use_baud(core.unit.baud))
+                device.at("baud", device.now() + BAUD_CHANGE_S, lambda: device.use_baud(device.unit.baud))
 
-        core.at("reset", core.now() + core.model.reset_s, complete)
+        device.at("reset", device.now() + device.model.reset_s, complete)
 
     def _restart(self, request: Request) -> None:
-        now = self._core.now()
+        now = self._device.now()
         if now - self._last_rb > REBOOT_PAIR_S:
             self._last_rb = now
             return self._reply(request.echo, "01")
         self._last_rb = float("-inf")
-        self._core.at("reboot", now + REBOOT_PAIR_S, self._reboot)
+        self._device.at("reboot", now + REBOOT_PAIR_S, self._reboot)
         return self._reply(request.echo, "00")
 
     def _set_baud(self, request: Request) -> None:
-        core = self._core
-        if core.model.link == "ethernet":
+        device = self._device
+        if device.model.link == "ethernet":
             return self._reply(request.echo, "0F")
         if not request.parameters.isdigit():
             return self._reply(request.echo, "01")
         baud = int(request.parameters)
         if baud not in BAUDS:
             return self._reply(request.echo, "02")
-        if baud == core.baud:
+        if baud == device.baud:
             return self._reply(request.echo, "03")
         self._reply(request.echo, "00")
-        return core.at("baud", core.now() + BAUD_CHANGE_S, lambda: core.use_baud(baud))
+        return device.at("baud", device.now() + BAUD_CHANGE_S, lambda: device.use_baud(baud))
 
     def _set_speed(self, request: Request) -> None:
-        """CR: 01 to 10 turn the motor 1 to 10 % slower, 00 and 99 as fast as it was made for."""
-        if not self._core.model.speeds:
+        """CR: 01 to 10 turn the motor 1 to 10 % slower, 00 and 99 at its nominal speed."""
+        if not self._device.model.speeds:
             return self._reply(request.echo, "04")
         if not request.parameters.isdigit():
             return self._reply(request.echo, "01")
@@ -239,7 +239,7 @@ class Console:
         return self._reply(request.echo, "00")
 
     def _set_sensitivity(self, request: Request) -> None:
-        """HS: kept and told apart, without effect on what is measured."""
+        """HS: stored and compared, without effect on the ranges."""
         if request.parameters not in (b"0", b"1"):
             return self._reply(request.echo, "01")
         if request.parameters == self._sensitivity:

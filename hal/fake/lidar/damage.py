@@ -1,11 +1,11 @@
-"""Damage to the bytes of one reply. Pure functions of the bytes, the fault and a source of chance."""
+"""Damages the bytes of one reply. Pure functions of the bytes, the fault and a random source."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from random import Random
 
-from hal.fake.faults import Fault
+from hal.fake.faults.orders import Fault
 
 HEAD_LINES = 2
 """Echo and status; data lines follow, and an empty line ends the reply."""
@@ -25,7 +25,7 @@ def _spans(reply: bytes) -> list[tuple[int, int]]:
 
 
 def _data_line(reply: bytes, chance: Random) -> int:
-    """Number of a data line, the last line of what a reply has when it has none."""
+    """Number of a random data line; the last line of a reply without data."""
     count = len(_lines(reply)) - 2  # two empty strings follow the last line
     first = min(HEAD_LINES + (1 if count > HEAD_LINES + 1 else 0), count - 1)
     return chance.randrange(first, count)
@@ -72,14 +72,14 @@ def duplicate_line(reply: bytes, _fault: Fault, chance: Random) -> bytes:
 
 
 def cut_frame(reply: bytes, _fault: Fault, chance: Random) -> bytes:
-    """Break off somewhere; the empty line that ends a reply is always lost."""
+    """Truncate at a random place; the empty line that ends a reply is always lost."""
     return reply[: chance.randrange(1, len(reply) - 1)]
 
 
-def splice(reply: bytes, alien: bytes, chance: Random) -> bytes:
-    """Put another reply between two bytes of this one."""
+def splice(reply: bytes, foreign: bytes, chance: Random) -> bytes:
+    """Insert another reply between two bytes of this one."""
     at = chance.randrange(1, len(reply) - 1)
-    return reply[:at] + alien + reply[at:]
+    return reply[:at] + foreign + reply[at:]
 
 
 DAMAGE: dict[str, Callable[[bytes, Fault, Random], bytes]] = {

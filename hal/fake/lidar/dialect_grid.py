@@ -1,9 +1,9 @@
-"""What a sensor does with a command in each state: one grid per dialect.
+"""Response of the sensor to a command in each state: one grid per SCIP dialect.
 
-``do`` carries the command out, ``--`` gives no answer at all, anything else is the status with which it is refused.
-The BM, QT, RS, TM and RB rows of 2.2 follow what UST sensors are known to do. The refusals of M* and G*, the
-TIME_ADJUST column of 2.0, the BOOTING row of M* and G* and the whole SLEEP column are readings of the documents that
-no sensor was at hand to confirm: drivers must get along with any of them.
+``do`` carries the command out, ``--`` sends no answer, any other entry is the status of a refusal. The BM, QT, RS, TM
+and RB rows of 2.2 follow the observed behaviour of UST sensors. The refusals of M* and G*, the TIME_ADJUST column of
+2.0, the BOOTING row of M* and G* and the SLEEP column follow the documents and were not confirmed on a sensor: drivers
+must cope with any of them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hal.fake.lidar.commands import SINGLES, STREAMS
 
 
 class State(Enum):
-    """Where the sensor stands; the value is its ``%ST`` code (MULTI and ERROR as in C-42-04076)."""
+    """State of the sensor; the value is its ``%ST`` code (MULTI and ERROR as in C-42-04076)."""
 
     IDLE = "000"
     BOOTING = "001"
@@ -71,7 +71,7 @@ ROW = {"VV": "ask", "PP": "ask", "II": "ask", "RT": "RS", "SS": "set", "CR": "se
 ROW |= dict.fromkeys(STREAMS, "M") | dict.fromkeys(SINGLES, "G")
 
 
-def answer(profile: Literal["2.0", "2.2"], state: State, name: str, parameters: bytes) -> str:
+def response(profile: Literal["2.0", "2.2"], state: State, name: str, parameters: bytes) -> str:
     """``do``, ``--`` or the status of a refusal."""
     if name == "TM":
         if parameters not in (b"0", b"1", b"2"):

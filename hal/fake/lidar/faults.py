@@ -1,15 +1,15 @@
-"""The words in which faults of a lidar are ordered."""
+"""The vocabulary of the fake lidar's faults."""
 
 from __future__ import annotations
 
-from hal.fake.faults import Parameter, Vocabulary, Word
+from hal.fake.faults.orders import Parameter, Vocabulary, Word
 from hal.fake.lidar.commands import PARAMETERS, SINGLES, STREAMS
 from hal.fake.lidar.output_line import MAX_JOIN
 from hal.fake.lidar.scip_encoder import MAX_3
 
 ON = {"on": Parameter("scans", choices=("scans", "replies", "all"))}
 COMMANDS = tuple(sorted({*PARAMETERS, *STREAMS, *SINGLES, "SC"}))
-"""As `hal.fake.lidar.commands.letters` tells them apart; SC is ``SCIP2.0``."""
+"""As returned by `hal.fake.lidar.commands.letters`; SC is ``SCIP2.0``."""
 
 LIDAR: Vocabulary = {
     # the general words
@@ -38,7 +38,7 @@ LIDAR: Vocabulary = {
         "strikes",
         {"command": Parameter("II", choices=("VV", "PP", "II"))},
     ),
-    # what a scan says
+    # content of a scan
     "status": Word("a scan's 99 is another status, without data", "strikes", {"code": Parameter(50, 0, 99)}),
     "frozen_stamp": Word("the stamp stands still while ranges go on", "strikes"),
     "stamp_jump": Word("stamps are off by `by_ms`", "strikes", {"by_ms": Parameter(-5000, -(1 << 24), 1 << 24)}),
@@ -85,4 +85,4 @@ LIDAR: Vocabulary = {
     "error": Word("stops with status `code` and refuses all but RB", "once", {"code": Parameter(70, 0, 99)}),
     "verify": Word("stops with 21 to check itself, resumes with 98 when lifted", "lasts"),
 }
-"""By word. ``off stuck garbage wrong slow delayed intermittent`` mean for a lidar what they mean for any device."""
+"""By word. ``off stuck garbage wrong slow delayed intermittent`` are common to all devices."""

@@ -1,4 +1,4 @@
-"""The text replies: identity (VV), parameters (PP), state (II), and the little that SCIP 1.1 says."""
+"""Text replies of the fake sensor: identity (VV), parameters (PP), state (II), and the V reply of SCIP 1.1."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ SPEEDS = {"usb": "USB Full Speed", "ethernet": "Ethernet 100[Mbps]"}
 
 
 @dataclass(slots=True)
-class Live:
-    """What II says beside the model's own texts. ``trouble`` replaces the health text."""
+class LiveState:
+    """Values of II that change at run time. ``trouble`` replaces the health text."""
 
     state: State
     laser: bool
@@ -38,7 +38,7 @@ def identity(model: LidarModel, unit: Unit, suffix: str = "") -> Lines:
 
 
 def parameters(model: LidarModel, dmax: int) -> Lines:
-    """Key and value of each PP line, with the DMAX that the sensor claims."""
+    """Key and value of each PP line, with the reported DMAX."""
     return [
         ("MODL", model.modl),
         ("DMIN", str(model.dmin)),
@@ -51,7 +51,7 @@ def parameters(model: LidarModel, dmax: int) -> Lines:
     ]
 
 
-def state(model: LidarModel, live: Live) -> Lines:
+def state(model: LidarModel, live: LiveState) -> Lines:
     """Key and value of each II line; TIME is six hexadecimal digits of the clock."""
     mode = {State.BOOTING: 1, State.SINGLE: 2, State.MULTI: 3}.get(live.state, 0)
     link = SPEEDS.get(model.link, f"{live.baud}[bps]<-Default setting by user")

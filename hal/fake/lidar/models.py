@@ -1,7 +1,7 @@
-"""Facts about the sensors that can be imitated: identity, geometry, timing, dialect (data sheets, SCIP documents).
+"""Sensor models of the fake: identity, geometry, timing, dialect (data sheets, SCIP documents).
 
-Values marked *assumed* are not stated by a document at hand; drivers must not depend on them anyway, because every
-sensor states its own geometry in ``PP``.
+Values marked *assumed* have no source. Drivers must not depend on them, since every sensor reports its geometry in
+``PP``.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ class LidarModel:
     Attributes:
         modl, prod, firm: texts of ``PP MODL``, ``VV PROD`` and ``VV FIRM``. vend: text of ``VV VEND``.
         dmin, dmax: legal distances in mm. ares: steps a turn. amin, amax, afrt: first, last and front step.
-        rpm: nominal speed (``PP SCAN``). true_period_s: what the motor really does.
-        profile: dialect, ``2.0`` (URG, UTM) or ``2.2`` (UST). link: how it is wired by default.
-        measures: measurement commands it knows; any other is unknown to it (``0E``).
+        rpm: nominal speed (``PP SCAN``). true_period_s: real period of the motor.
+        profile: dialect, ``2.0`` (URG, UTM) or ``2.2`` (UST). link: default connection.
+        measures: supported measurement commands; any other is unknown (``0E``).
         latency_s, jitter_s: time to a reply is ``latency_s + |N(0, jitter_s)|``.
         tick_s: replies and scans leave on multiples of this on the sensor's clock; 0: at once. (UST firmware 4.0.0 to
             4.0.2: 5 ms.)
         boot_s: power-on to ready. reset_s: time a reset command takes before its reply.
-        speeds: knows CR, by which the motor is slowed down.
+        speeds: supports CR, which slows the motor down.
         modes: texts of ``II MESM`` for idle, booting, single, streaming. stat: text of ``II STAT`` while healthy.
     """
 
@@ -154,15 +154,15 @@ MODELS: dict[str, LidarModel] = {
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """What differs between two sensors of one model.
+    """Properties of one sensor of a model.
 
     Attributes:
-        serial: text of ``VV SERI``. clock_ms: reading of the 24-bit clock when the device object is made.
+        serial: text of ``VV SERI``. clock_ms: initial reading of the 24-bit clock.
         clock_gain: relative error of the clock, 50e-6 = 50 ppm fast. baud: rate of the RS-232 line after power-on.
         strict_time: ``TM1`` outside time-adjust mode is refused with ``04`` (most real sensors answer).
-        booted: True: already up when the device object is made; False: starts in BOOTING.
+        booted: True: already booted at the start; False: starts in BOOTING.
         scip1: starts in SCIP 1.1 (old URG-04LX) and returns to it at every power-on.
-        spin_up_s: the motor delivers no scan until this long after power-on.
+        spin_up_s: time from power-on to the first scan.
         seed: of the jitter and of random faults.
     """
 

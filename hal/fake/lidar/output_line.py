@@ -1,4 +1,4 @@
-"""From the sensor's output buffer to the host: order, line rate, pieces, and what happens when nobody listens."""
+"""The fake sensor's output line to the host: queue, line rate, write sizes, and losses."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ MAX_JOIN = 100
 
 
 class HostEnd(Protocol):
-    """Where the bytes go: a memory port, a pty, a TCP connection."""
+    """The host's end of the line: a memory port, a pty, a TCP connection."""
 
-    def take(self, data: bytes) -> bool:
-        """Accept bytes; False when there was no room and all of them were dropped."""
+    def accept(self, data: bytes) -> bool:
+        """Accept bytes; False where there is no room and all of them were dropped."""
         ...
 
     def hang_up(self) -> None:
-        """Tear the connection as a pulled plug or a closing sensor does."""
+        """Break the connection, as an unplug or a closing sensor does."""
         ...
 
     def baud(self) -> int:
-        """Line rate the host listens at; 0 when that means nothing or is not known."""
+        """The host's line rate, bit/s; 0 where it has none or it is unknown."""
         ...
 
 
 @dataclass(slots=True)
 class Pacing:
-    """How bytes leave.
+    """Transmission of bytes.
 
     Attributes:
         rate: bytes per second of the line; 0: no limit.
         piece: bytes per write; 0: whole replies.
-        split_end: the last LF of every reply comes as a piece of its own.
+        split_end: the last LF of every reply is a write of its own.
         join: data replies gathered into one write.
-        backlog: data replies that may wait for the line before new ones are lost inside the sensor.
+        backlog: data replies queued for the line before new ones are lost inside the sensor.
     """
 
     rate: float = 0.0
@@ -49,7 +49,7 @@ class Pacing:
 
 @dataclass(slots=True)
 class Parcel:
-    """Bytes on their way: they occupy the line from ``line_start`` to ``line_end`` and arrive, in ``total`` pieces.
+    """Bytes in transmission: they occupy the line from ``line_start`` to ``line_end`` and arrive in ``total`` pieces.
 
     The last piece arrives at ``t_end``.
     """
@@ -64,35 +64,35 @@ class Parcel:
 
 
 @dataclass(slots=True)
-class OutletCounts:
-    """What became of the replies.
+class OutputCounts:
+    """Counters of replies.
 
     Attributes:
-        sent: handed to the host. unheard: nobody had opened the line.
-        lost_in_sensor: scans for which the line was too slow.
-        refused_by_host: the host's queue was full (nobody reads).
+        sent: delivered to the host. without_host: no host had opened the line.
+        lost_in_sensor: scans lost because the line was too slow.
+        refused_by_host: lost because the host's queue was full.
     """
 
     sent: int = 0
-    unheard: int = 0
+    without_host: int = 0
     lost_in_sensor: int = 0
     refused_by_host: int = 0
 
 
-class Outlet:
+class OutputLine:
     """A first-in-first-out line to at most one host.
 
     Args:
         loop: the clock of all times.
-        pacing: how bytes leave.
-        heard: what the host hears of bytes that arrive now (noise when it listens at another rate).
+        pacing: rate and write sizes.
+        received: maps sent bytes to those that the host receives (random ones at another line rate).
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, pacing: Pacing, heard: Callable[[bytes], bytes]) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, pacing: Pacing, received: Callable[[bytes], bytes]) -> None:
         self._loop = loop
-        self._heard = heard
+        self._received = received
         self.pacing = pacing
-        self.counts = OutletCounts()
+        self.counts = OutputCounts()
         self.host: HostEnd | None = None
         self._queue: deque[Parcel] = deque()
         self._gathered: list[bytes] = []
@@ -101,9 +101,9 @@ class Outlet:
         self._held = False
 
     def send(self, data: bytes, *, is_scan: bool = False, delay: float = 0.0) -> None:
-        """Queue a reply; it occupies the line when that is free and arrives ``delay`` seconds later, in order.
+        """Queue a reply; it occupies the line once that is free and arrives ``delay`` seconds later, in order.
 
-        Scans are lost when as many as the sensor can hold wait for the line already.
+        A scan is lost when the sensor's backlog is full.
         """
         if is_scan and self.pacing.join > 1:
             self._gathered.append(data)
@@ -125,21 +125,21 @@ class Outlet:
         self._wake()
 
     def drop_waiting_scans(self) -> None:
-        """Forget scans that have not begun to leave (the stream was stopped); the one on the line is finished."""
+        """Drop queued scans (the stream was stopped); the one in transmission is completed."""
         now = self._loop.time()
         self._keep([p for p in self._queue if not p.is_scan or p.line_start <= now])
 
     def clear(self) -> None:
-        """Forget everything (power lost, plug pulled)."""
+        """Drop everything (power lost, unplugged)."""
         self._keep([])
 
     def hold(self, held: bool) -> None:
-        """Keep everything back on the way to the host; letting go delivers it at once."""
+        """Hold all replies back, or (False) deliver them at once."""
         self._held = held
         self._restart()
 
     def rewrap(self, piece: int = 0, split_end: bool = False, join: int = 1) -> None:
-        """Cut and gather the replies to come in another way; without arguments as whole replies."""
+        """Change the write sizes of the next replies; without arguments: whole replies."""
         self.pacing.piece, self.pacing.split_end, self.pacing.join = piece, split_end, join
         self._gathered.clear()
 
@@ -175,8 +175,8 @@ class Outlet:
         piece = head.pieces.popleft()
         if self.host is None:
             head.pieces.clear()
-            self.counts.unheard += 1
-        elif not self.host.take(self._heard(piece)):
+            self.counts.without_host += 1
+        elif not self.host.accept(self._received(piece)):
             head.pieces.clear()
             self.counts.refused_by_host += 1
         elif not head.pieces:

@@ -1,4 +1,4 @@
-"""From a scan of the world to the payload a measurement command asks for: range of steps, grouping, echoes."""
+"""Builds the payload of a measurement reply from a scan: range of steps, clusters, echoes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Ints = npt.NDArray[np.int32]
 
 
 def chosen_steps(distance: Ints, wanted: Measure, dmin: int) -> npt.NDArray[np.intp]:
-    """Steps that are sent: every one, or with grouping the nearest that is no error code of each group.
+    """Steps to send: every one, or with clusters the nearest one of each cluster that is no error code.
 
-    The last group may be smaller (one reading of the documents: ``ceil(k / n)`` outputs).
+    The last cluster may be smaller (one reading of the documents: ``ceil(k / n)`` outputs).
     """
     steps = np.arange(wanted.start, wanted.end + 1)
     if wanted.cluster == 1:
@@ -29,9 +29,9 @@ def chosen_steps(distance: Ints, wanted: Measure, dmin: int) -> npt.NDArray[np.i
 
 
 def payload(name: str, wanted: Measure, scan: FakeScan, dmin: int, extra: int = 0) -> bytes:
-    """Characters of one scan as command ``name`` sends them (MD GD, MS GS, ME GE, ND HD, NE HE).
+    """Characters of one scan for command ``name`` (MD GD, MS GS, ME GE, ND HD, NE HE).
 
-    ``extra`` is the fault of sending more steps than were asked for (the last one again), or fewer.
+    ``extra``: by a fault, steps sent beyond the requested ones (the last one repeated), or fewer where negative.
     """
     steps = chosen_steps(scan.ranges_mm, wanted, dmin)
     if extra:

@@ -1,4 +1,4 @@
-"""The spinning head: when the sensor passes step 0 of each revolution."""
+"""The rotating mirror of the fake sensor: the times at which it passes step 0 of each revolution."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 TINY = 1e-9
-"""Seconds; instants closer than this are the same revolution."""
+"""Seconds; times closer than this are the same revolution."""
 
 
 class Rotor(Protocol):
-    """Revolutions are counted by an index; ``t_mono`` of step 0 rises with it."""
+    """Revolutions, numbered by an index; ``t_mono`` of step 0 increases with it."""
 
     def index_after(self, t_mono: float) -> int:
         """Index of the first revolution that begins at ``t_mono`` or later."""
         ...
 
     def start_of(self, index: int) -> float | None:
-        """``t_mono`` at which the revolution passes step 0; None when there is no such revolution."""
+        """``t_mono`` at which the revolution passes step 0; None where it does not exist."""
         ...
 
     def period_of(self, index: int) -> float:
-        """Seconds that revolution takes."""
+        """Duration of a revolution, s."""
         ...
 
     def set_period(self, t_mono: float, period_s: float) -> None:
-        """Turn at another speed from the first revolution after ``t_mono`` on."""
+        """Change the period from the first revolution after ``t_mono``."""
         ...
 
 
@@ -73,11 +73,11 @@ class EvenRotor:
 
 
 class TimetableRotor:
-    """Revolutions at given instants, so that a recorded log keeps its own uneven rhythm; then no more.
+    """Revolutions at given times, for a recorded log with its own uneven rhythm; none after the last.
 
     Args:
-        starts: rising ``t_mono`` of step 0.
-        period_s: time a turn takes, for the spread of the beams and for when a scan is complete.
+        starts: increasing ``t_mono`` of step 0.
+        period_s: duration of a revolution, for the times of its beams and of its completion.
     """
 
     def __init__(self, starts: Sequence[float], period_s: float) -> None:
@@ -99,5 +99,5 @@ class TimetableRotor:
         return self._period_s
 
     def set_period(self, t_mono: float, period_s: float) -> None:
-        """A timetable keeps its instants; only the spread of the beams changes."""
+        """Change the times of the beams; the start times stay."""
         self._period_s = period_s

@@ -1,4 +1,4 @@
-"""What the simulated world hands to a fake lidar: the contract for simulators, log converters and tests."""
+"""The contract of a scan source for the fake lidar: used by simulators, log converters and tests."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 class FakeScan:
     """One revolution of the sensor. Arrays have one element per step, **steps 0 to AMAX** (AMAX + 1 elements).
 
-    Elements below AMIN are never sent; whatever stands there is ignored.
+    Elements below AMIN are ignored.
 
     Attributes:
         ranges_mm: int32, millimetres as the sensor would report them: values below DMIN are error codes, above DMAX
@@ -31,5 +31,5 @@ class FakeScan:
 
 ScanSource = Callable[[float], FakeScan | None]
 """Called with the ``t_mono`` at which the sensor passes step 0 of a revolution; the beam of step s is measured
-``s * period / ARES`` later. Called once for each revolution whose data are wanted, in rising order of time, when the
-revolution is complete. None means that the sensor has nothing to say about this revolution (a log ended)."""
+``s * period / ARES`` later. Called once for each requested revolution, in order of time, when the revolution is
+complete. None: no data for this revolution (a log ended)."""

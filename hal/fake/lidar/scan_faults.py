@@ -1,4 +1,4 @@
-"""Faults of what a scan says: values that are wrong although every byte arrives as it was sent."""
+"""Faults of a scan's values: wrong ranges, codes or intensities in valid replies."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from random import Random
 
 import numpy as np
 
+from hal.fake.faults.schedule import ActiveFaults
 from hal.fake.lidar.models import LidarModel
 from hal.fake.lidar.scan import FakeScan
-from hal.fake.schedule import Orders
 
 
-def altered(scan: FakeScan, orders: Orders, model: LidarModel, chance: Random) -> FakeScan:
+def altered(scan: FakeScan, orders: ActiveFaults, model: LidarModel, chance: Random) -> FakeScan:
     """The scan after the faults ``wrong``, ``codes`` and ``dark`` that strike it.
 
-    ``wrong`` shifts measured distances and keeps them in the legal range; error codes stay what they are.
+    ``wrong`` shifts measured distances and keeps them in the legal range; error codes are unchanged.
     """
     fault = orders.strike("wrong")
     if fault:

@@ -1,6 +1,6 @@
-"""Two small worlds for a fake lidar: a room in which the sensor wanders about, and recorded ranges.
+"""Two scan sources for the fake lidar: a small room with a moving sensor, and recorded ranges.
 
-They exist so that a daemon can be tried without a sensor. They are no physics: no glass, no mixed pixels, no people.
+They serve to try a daemon without a sensor. They do not model glass, mixed pixels or people.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hal.fake.lidar.models import LidarModel
 from hal.fake.lidar.scan import FakeScan
 
 NO_OBJECT = 1
-"""Error code for a beam that finds nothing (UTM: no object in range; URG: too little light)."""
+"""Error code of a beam without a return (UTM: no object in range; URG: too little light)."""
 
 ROOM = ((0.0, 0.0), (7.0, 0.0), (7.0, 3.5), (6.2, 3.5), (6.2, 5.0), (1.0, 5.0), (1.0, 4.2), (0.0, 4.2))
 COLUMN = ((3.4, 3.3), (3.7, 3.3), (3.7, 3.6), (3.4, 3.6))
@@ -25,7 +25,7 @@ COLUMN = ((3.4, 3.3), (3.7, 3.3), (3.7, 3.6), (3.4, 3.6))
 
 CENTRE, HALF_AXES = (3.3, 1.9), (1.6, 0.7)
 LAP_S = 60.0
-"""The sensor goes round an ellipse once in this time, looking ahead: at most 0.17 m/s and 0.25 rad/s."""
+"""Time of one round on the ellipse, heading along it: at most 0.17 m/s and 0.25 rad/s."""
 
 
 def _walls() -> npt.NDArray[np.float64]:
@@ -36,7 +36,7 @@ def _walls() -> npt.NDArray[np.float64]:
 
 
 class Room:
-    """A `ScanSource`: a room of 7 x 5 m with a column, seen from an ellipse around its middle.
+    """A `ScanSource`: a room of 7 x 5 m with a column, scanned from an ellipse around its middle.
 
     Args:
         model: the sensor.
@@ -64,7 +64,7 @@ class Room:
         return np.column_stack((x, y, heading))
 
     def __call__(self, t_mono: float) -> FakeScan:
-        """The revolution that passes step 0 at ``t_mono``; every beam is measured from where the sensor is then."""
+        """The revolution that passes step 0 at ``t_mono``; every beam is cast from the pose at its own time."""
         pose = self.pose(np.asarray(t_mono + self._beam_t, dtype=np.float64))
         ranges = 1e3 * self._cast(pose[:, :2], pose[:, 2] + self._bearings)
         ranges = np.rint(ranges + self._chance.normal(0.0, self._noise, ranges.size))
@@ -87,16 +87,16 @@ class Room:
 
 
 class RecordedRanges:
-    """A :data:`hal.fake.lidar.scan.ScanSource`: one recorded scan for each revolution that is asked for, then nothing.
+    """A :data:`hal.fake.lidar.scan.ScanSource`: one recorded scan for each revolution, then None.
 
     Args:
         path: ``.npz`` file with an array ``range_mm`` of shape (scans, steps), steps from AMIN (or 0) to AMAX, and
             optionally ``intensity`` of the same shape.
-        model: the sensor that is to say it.
+        model: the sensor that reports them.
 
     Raises:
         DeviceMissing: no such file.
-        DataInvalid: not such a file, or ranges of another width than the sensor's.
+        DataInvalid: not an ``.npz`` file of ranges, or a width other than the sensor's.
     """
 
     def __init__(self, path: Path, model: LidarModel) -> None:

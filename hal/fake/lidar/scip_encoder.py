@@ -1,7 +1,7 @@
-"""What a SCIP 2.0 sensor puts on the wire, written from the sensor's side of the specification (C-42-03320B).
+"""The sensor's SCIP 2.0 encoder, written from the specification (C-42-03320B).
 
-Pure functions: numbers and text in, bytes out. The driver's codec is another implementation of the same document and
-is never imported here, so that neither can hide the other's error.
+Pure functions: numbers and text in, bytes out. The driver's codec is a separate implementation and is never imported
+here, so that an error of one cannot hide an error of the other.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def number(value: int, chars: int) -> bytes:
 
 
 def numbers(values: Ints, chars: int) -> Chars:
-    """Encode an array of n values as uint8 of shape (n, ``chars``); values are clipped to what the characters hold."""
+    """Encode an array of n values as uint8 of shape (n, ``chars``); values are clipped to their range."""
     clipped = np.clip(values, 0, (1 << (6 * chars)) - 1)
     out = np.empty((clipped.size, chars), dtype=np.uint8)
     for i in range(chars):
@@ -70,13 +70,13 @@ def text_line(key: str, value: str) -> bytes:
 
 
 def text_line_summed_whole(key: str, value: str) -> bytes:
-    """The variant of some firmware: the semicolon is summed too."""
+    """A firmware variant: the semicolon is summed, too."""
     text = f"{key}:{value};".encode("ascii")
     return text + checksum(text) + b"\n"
 
 
 def text_line_summed_to_mark(key: str, value: str) -> bytes:
-    """The variant of some UTM-30LX firmware: ``value<-remark`` is summed up to and including ``<-``."""
+    """A variant of UTM-30LX firmware: ``value<-remark`` is summed up to and including ``<-``."""
     text = f"{key}:{value}".encode("ascii")
     mark = text.find(b"<-")
     summed = text[: mark + 2] if mark >= 0 else text
@@ -84,7 +84,7 @@ def text_line_summed_to_mark(key: str, value: str) -> bytes:
 
 
 TEXT_SUMS = {"plain": text_line, "whole": text_line_summed_whole, "mark": text_line_summed_to_mark}
-"""The ways firmware sums its text lines."""
+"""Checksum variants of text lines in firmware."""
 
 
 def reply(echo: bytes, status: str, body: bytes = b"") -> bytes:
@@ -119,7 +119,7 @@ def multi_echo(distance: Ints, further: Ints, intensity: Ints | None = None, wea
         distance: first echoes, n values.
         further: shape (n, m), m <= 2, 0 where there is no such echo.
         intensity: of the first echoes.
-        weaker: intensity of the further ones, shaped as ``further``; sent as 0 where not given.
+        weaker: intensity of the further ones, shape as ``further``; sent as 0 where not given.
     """
     count, more = further.shape
     width = 3 if intensity is None else 6

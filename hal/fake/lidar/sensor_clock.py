@@ -1,4 +1,4 @@
-"""The sensor's own clock: 24-bit milliseconds, off in rate, zeroed by resets, true only to itself."""
+"""The sensor's clock: 24-bit milliseconds with a rate error, zeroed by resets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class SensorClock:
     """Maps ``t_mono`` to the sensor's milliseconds.
 
     Args:
-        t_mono: now. start_ms: what the clock shows now. gain: relative rate error, 50e-6 = 50 ppm fast.
+        t_mono: now. start_ms: reading of the clock now. gain: relative rate error, 50e-6 = 50 ppm fast.
     """
 
     def __init__(self, t_mono: float, start_ms: float, gain: float) -> None:
@@ -24,15 +24,15 @@ class SensorClock:
         return self._ms + (t_mono - self._t_mono) * 1e3 * (1.0 + self.gain)
 
     def tick(self, t_mono: float) -> int:
-        """The 24-bit stamp of an instant: whole milliseconds, cut off."""
+        """The 24-bit stamp of a time: whole milliseconds, truncated."""
         return math.floor(self.ms(t_mono) + 1e-7) % WRAP
 
     def set(self, t_mono: float, ms: float = 0.0) -> None:
-        """Show ``ms`` at ``t_mono``; 0 is what RS, RT, RB and power-on do."""
+        """Set the clock to ``ms`` at ``t_mono``; RS, RT, RB and power-on set 0."""
         self._t_mono, self._ms = t_mono, ms
 
     def next_tick(self, t_mono: float, tick_s: float) -> float:
-        """First ``t_mono`` not before the given one at which the clock shows a multiple of ``tick_s``."""
+        """First ``t_mono`` from the given one on at which the clock is a multiple of ``tick_s``."""
         if tick_s <= 0.0:
             return t_mono
         step_ms = tick_s * 1e3

@@ -19,6 +19,7 @@ from daemon.config.residual_file import ResidualError, read_residuals, write_res
 from daemon.config.schema import Config, LidarConfig, Mount
 from daemon.config.survey_loader import read_survey, residuals_beside, write_survey
 from daemon.replay.results import Trajectory
+from daemon.system import console
 from estimator.cdma.air_interface import PROFILE_B
 from estimator.cdma.epoch import BlockFlag, LightEpoch
 from estimator.light_filter.lambertian import expected
@@ -70,7 +71,7 @@ def test_calibrate_writes_a_better_survey_with_its_map(
     played: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "new.toml"
-    assert parser.main(["calibrate", "teach", "--out", str(out)]) == parser.OK
+    assert parser.main(["calibrate", "teach", "--out", str(out)]) == console.OK
     said = capsys.readouterr().out
     assert "before" in said
     assert "rx_slope_x" in said
@@ -84,7 +85,7 @@ def test_calibrate_writes_a_better_survey_with_its_map(
     assert read_residuals(residuals_beside(out), survey) is not None
     assert out.with_suffix(".png").stat().st_size > 10_000
     # nothing is overwritten unasked, and that is said before any work
-    assert parser.main(["calibrate", "teach", "--out", str(out)]) == parser.FAILED
+    assert parser.main(["calibrate", "teach", "--out", str(out)]) == console.FAILED
     assert "--force" in capsys.readouterr().err
 
 
@@ -93,7 +94,7 @@ def test_survey_writes_lamps_with_uncertainties(
     played: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "lights.toml"
-    assert parser.main(["survey", "teach", "--height", "2.9", "--out", str(out)]) == parser.OK
+    assert parser.main(["survey", "teach", "--height", "2.9", "--out", str(out)]) == console.OK
     assert "sigma m" in capsys.readouterr().out
     found = {lamp.code: lamp for lamp in read_survey(out).lamps}
     lamps = nominal(2).lamps
@@ -101,7 +102,7 @@ def test_survey_writes_lamps_with_uncertainties(
     apart = np.hypot(found[0].x - found[7].x, found[0].y - found[7].y)
     assert apart == pytest.approx(2.5, abs=0.1)
     assert "passed at" in out.read_text()
-    assert parser.main(["survey", "teach", "--out", str(out)]) == parser.FAILED
+    assert parser.main(["survey", "teach", "--out", str(out)]) == console.FAILED
 
 
 @pytest.fixture
@@ -122,7 +123,7 @@ def driven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Drive:
 def test_the_mount_is_written_as_a_configuration_with_a_picture(
     driven: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert parser.main(["calibrate", "teach", "--lidar-mount"]) == parser.OK
+    assert parser.main(["calibrate", "teach", "--lidar-mount"]) == console.OK
     said = capsys.readouterr().out
     out = tmp_path / "lumiloop-calibrated.toml"
     written = load(out)
@@ -137,14 +138,14 @@ def test_the_mount_is_written_as_a_configuration_with_a_picture(
     assert pasted == {"x": mount.x, "y": mount.y, "yaw": mount.yaw}
     assert "scale" not in out.read_text()
     assert out.with_suffix(".png").stat().st_size > 10_000
-    assert parser.main(["check", str(out)]) == parser.OK
+    assert parser.main(["check", str(out)]) == console.OK
 
 
 def test_what_the_wheels_told_is_at_the_head_of_the_configuration(
     driven: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "robot.toml"
-    assert parser.main(["calibrate", "teach", "--odometry", "--out", str(out)]) == parser.OK
+    assert parser.main(["calibrate", "teach", "--odometry", "--out", str(out)]) == console.OK
     said = capsys.readouterr().out
     assert "mount" not in said
     head = [line for line in out.read_text().splitlines() if line.startswith("#")]
@@ -162,13 +163,13 @@ def test_a_configuration_is_not_overwritten_unasked(
     out = tmp_path / "robot.toml"
     out.write_text("name = 'mine'\n")
     words = ["calibrate", "teach", "--lidar-mount", "--out", str(out)]
-    assert parser.main(words) == parser.FAILED
+    assert parser.main(words) == console.FAILED
     assert "--force" in capsys.readouterr().err
     assert out.read_text() == "name = 'mine'\n"
     assert [file.name for file in tmp_path.iterdir()] == ["robot.toml"]
-    assert parser.main([*words, "--force"]) == parser.OK
+    assert parser.main([*words, "--force"]) == console.OK
     assert load(out).name == "r7"
-    assert parser.main([*words[:-1], str(tmp_path / "nowhere" / "robot.toml")]) == parser.FAILED
+    assert parser.main([*words[:-1], str(tmp_path / "nowhere" / "robot.toml")]) == console.FAILED
     assert "cannot write" in capsys.readouterr().err
 
 
@@ -184,10 +185,10 @@ def test_what_is_missing_is_said(
         fields = {name: getattr(played, name) for name in ("path", "poses", "survey", "epochs", "readings")}
         other = Drive(**{**fields, **change})
         monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_, other=other: other)
-        assert parser.main(["calibrate", "teach", *out]) == parser.FAILED
+        assert parser.main(["calibrate", "teach", *out]) == console.FAILED
         assert words in capsys.readouterr().err
     monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_: Drive(Path("t"), played.poses, played.survey))
-    assert parser.main(["calibrate", "teach", "--odometry"]) == parser.FAILED
+    assert parser.main(["calibrate", "teach", "--odometry"]) == console.FAILED
     assert "no odometry in it" in capsys.readouterr().err
 
 
@@ -199,15 +200,15 @@ def test_a_survey_for_another_air_interface_is_refused(
     path = tmp_path / "lights.toml"
     path.write_text("lamp = [ { lamp_id = 7, code = 65, x = 0.0, y = 0.0, z = 2.6 } ]")
     assert (
-        parser.main(["calibrate", "teach", "--survey", str(path), "--out", str(tmp_path / "x.toml")]) == parser.FAILED
+        parser.main(["calibrate", "teach", "--survey", str(path), "--out", str(tmp_path / "x.toml")]) == console.FAILED
     )
     assert "lamp 7: code 65 is none of profile B, which has codes 0 to 64" in capsys.readouterr().err
 
 
 def test_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert parser.main(["calibrate", str(tmp_path / "none"), "--out", str(tmp_path / "x.toml")]) == parser.FAILED
+    assert parser.main(["calibrate", str(tmp_path / "none"), "--out", str(tmp_path / "x.toml")]) == console.FAILED
     assert "none" in capsys.readouterr().err
-    assert parser.main(["survey", str(tmp_path / "none"), "--out", str(tmp_path / "x.toml")]) == parser.FAILED
+    assert parser.main(["survey", str(tmp_path / "none"), "--out", str(tmp_path / "x.toml")]) == console.FAILED
 
 
 def test_strengths_without_a_pose_near_are_left_out(taught: Drive) -> None:

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli import check, parser
+from daemon.cli import parser
+from daemon.diagnosis import map_folder
 from daemon.maps.store import Store
-from tests.daemon.mapmaker import Shape, content
+from daemon.system import console
+from tests.daemon.support.map_maker import Shape, content
 
 SURVEY = """
 lamp = [
@@ -29,7 +31,7 @@ def write(folder: Path, survey: str = SURVEY, bus: str = "/dev/i2c-99") -> Path:
 
 def test_all_good_but_the_bus_is_elsewhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path)
-    assert parser.main(["check", str(file)]) == parser.OK
+    assert parser.main(["check", str(file)]) == console.OK
     good, survey, bus, _ = capsys.readouterr().out.splitlines()
     assert good == f"{file}: good"
     assert survey == f"{tmp_path.resolve() / 'lights.toml'}: good, 2 lamps"
@@ -49,7 +51,7 @@ def test_a_bad_survey_is_refused_with_its_place(
 ) -> None:
     file = write(tmp_path, survey)
     for command in (["check", str(file)], ["run", "--config", str(file), "--set", "modbus.port=0"]):
-        assert parser.main(command) == parser.USAGE
+        assert parser.main(command) == console.USAGE
         said = capsys.readouterr()
         if command[0] == "check":
             assert words in said.err
@@ -60,7 +62,7 @@ def test_a_bad_survey_is_refused_with_its_place(
 def test_a_code_that_the_profile_does_not_have_is_refused(
     tmp_path: Path, code: int, profile: str, last: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for number, expected in ((last, parser.OK), (code, parser.USAGE)):
+    for number, expected in ((last, console.OK), (code, console.USAGE)):
         file = write(tmp_path, SURVEY.replace("code = 17", f"code = {number}"))
         assert parser.main(["check", str(file), "--set", f"photodiode.profile={profile}"]) == expected
     said = capsys.readouterr().err
@@ -75,7 +77,7 @@ def test_all_that_is_wrong_is_told_in_one_round(tmp_path: Path, capsys: pytest.C
     maps = tmp_path / "maps"
     with file.open("a") as more:
         more.write(f'[modbus]\nprt = 3\n[map]\nfolder = "{maps}"\nlocalise = true\n')
-    assert parser.main(["check", str(file), "--set", "odometry.port=x"]) == parser.USAGE
+    assert parser.main(["check", str(file), "--set", "odometry.port=x"]) == console.USAGE
     said = capsys.readouterr().err
     assert [
         line.replace(f"{tmp_path.resolve()}/", "").removeprefix("lumiloop: ").split(": ")[0]
@@ -89,7 +91,7 @@ def test_all_that_is_wrong_is_told_in_one_round(tmp_path: Path, capsys: pytest.C
         "maps",
     ]
     (tmp_path / "lights.toml").unlink()
-    assert parser.main(["check", str(file)]) == parser.USAGE
+    assert parser.main(["check", str(file)]) == console.USAGE
     assert "lights.toml: no such survey" in capsys.readouterr().err
 
 
@@ -105,7 +107,7 @@ def test_what_hangs_on_a_wrong_key_is_not_judged(
     file.write_text(
         f"lights.survey = 'lights.toml'\n[photodiode]\n{line}\n" if "lights" not in line else f"[photodiode]\n{line}\n"
     )
-    assert parser.main(["check", str(file)]) == parser.USAGE
+    assert parser.main(["check", str(file)]) == console.USAGE
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1
     assert silent not in said
@@ -114,23 +116,23 @@ def test_what_hangs_on_a_wrong_key_is_not_judged(
 def test_a_survey_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path)
     (tmp_path / "lights.toml").unlink()
-    assert parser.main(["check", str(file)]) == parser.USAGE
+    assert parser.main(["check", str(file)]) == console.USAGE
     assert "lights.toml: no such survey" in capsys.readouterr().err
 
 
 def test_the_line_that_names_a_bad_survey_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path)
     (tmp_path / "lights.toml").unlink()
-    assert parser.main(["check", str(file)]) == parser.USAGE
+    assert parser.main(["check", str(file)]) == console.USAGE
     assert f"({file}:4 names it: `lights.survey`)" in capsys.readouterr().err
-    assert parser.main(["check", str(file), "--set", f"lights.survey={tmp_path}/none.toml"]) == parser.USAGE
+    assert parser.main(["check", str(file), "--set", f"lights.survey={tmp_path}/none.toml"]) == console.USAGE
     assert "none.toml: no such survey" in (said := capsys.readouterr().err)
     assert "(`lights.survey` names it)" in said
 
 
 def test_a_survey_that_nothing_looks_at_is_remarked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path, bus="")
-    assert parser.main(["check", str(file)]) == parser.OK
+    assert parser.main(["check", str(file)]) == console.OK
     assert "the survey is not used: `photodiode.bus` is empty" in capsys.readouterr().out
 
 
@@ -149,14 +151,14 @@ def test_a_mount_in_other_units_is_remarked(
 ) -> None:
     file = tmp_path / "robot.toml"
     file.write_text(f'map.folder = "none"\nlidar.mount = {{ {mount} }}\n')
-    assert parser.main(["check", str(file)]) == parser.OK
+    assert parser.main(["check", str(file)]) == console.OK
     assert capsys.readouterr().out.splitlines()[1:] == ([remark] if remark else [])
 
 
 def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "robot.toml"
     file.write_text('map.folder = "/proc/maps"\n')
-    assert parser.main(["check", str(file)]) == parser.OK
+    assert parser.main(["check", str(file)]) == console.OK
     assert "/proc/maps: cannot be made by this user" in capsys.readouterr().out
 
 
@@ -164,14 +166,14 @@ def test_the_folder_of_maps_is_looked_at(tmp_path: Path, capsys: pytest.CaptureF
     maps, file = tmp_path / "maps", tmp_path / "robot.toml"
     file.write_text(f'[map]\nfolder = "{maps}"\n')
 
-    def said(*more: str, code: int = parser.OK) -> str:
+    def said(*more: str, code: int = console.OK) -> str:
         assert parser.main(["check", str(file), *more]) == code
         words = capsys.readouterr()
         return words.out + words.err
 
     alone = ("--set", "map.localise=true")
     assert f"{maps}: not there yet" in said()
-    assert "`run` would be refused" in said(*alone, code=parser.FAILED)
+    assert "`run` would be refused" in said(*alone, code=console.FAILED)
     Store(maps).save(whole := content(Shape(submaps=3, map_id=7)), 7)
     assert f"{maps}: map 00000007 (second floor, Süd) of 3 submaps is good" in said(*alone)
     (maps / "map-00000007-00000002.lumimap").write_bytes(whole[:-1])
@@ -190,13 +192,13 @@ def test_a_lock_of_the_same_number_on_another_disk_is_another_one(
     line = "1: FLOCK  ADVISORY  WRITE {} {:02x}:{:02x}:{} 0 EOF\n"
     place = (os.major(about.st_dev), os.minor(about.st_dev))
     foreign = line.format(11, place[0] + 1, place[1], about.st_ino)
-    monkeypatch.setattr(check, "LOCKS", listed)
+    monkeypatch.setattr(map_folder, "LOCKS", listed)
     with lock.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         listed.write_text(foreign)
-        assert check._keeper(lock) == "another process"
+        assert map_folder._keeper(lock) == "another process"
         listed.write_text(foreign + line.format(22, *place, about.st_ino))
-        assert check._keeper(lock) == "process 22"
+        assert map_folder._keeper(lock) == "process 22"
 
 
 def test_a_folder_that_another_daemon_has_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -206,7 +208,7 @@ def test_a_folder_that_another_daemon_has_is_said(tmp_path: Path, capsys: pytest
     other.claim()
 
     def said(*more: str) -> str:
-        assert parser.main(["check", str(file), *more]) == parser.OK
+        assert parser.main(["check", str(file), *more]) == console.OK
         return capsys.readouterr().out
 
     words = f"; process {os.getpid()} keeps its maps there, and no other can (fault 403)"

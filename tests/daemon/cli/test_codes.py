@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from daemon.cli import parser
+from daemon.system import console
 from tools.sim.light.transmitter import Lamp, code_bits
 
 ROOT = Path(__file__).parents[3]
@@ -21,7 +22,7 @@ DEGREES = {"A": 7, "B": 6, "D": 9}
 
 
 def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    assert parser.main(["codes", *words]) == parser.OK
+    assert parser.main(["codes", *words]) == console.OK
     return capsys.readouterr().out
 
 
@@ -80,7 +81,7 @@ def test_a_c_compiler_reads_the_same_bits(profile: str, tmp_path: Path, capsys: 
 
 @pytest.mark.parametrize("code", ["129", "-1"])
 def test_a_code_that_does_not_exist(code: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert parser.main(["codes", "--code", code]) == parser.USAGE
+    assert parser.main(["codes", "--code", code]) == console.USAGE
     assert capsys.readouterr().err == f"lumiloop: --code {code}: profile A has codes 0 to 128\n"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from daemon.cli.explain import entries, find
-from daemon.cli.parser import FAILED, OK, main, parser
+from daemon.cli.parser import main, parser
 from daemon.config.loader import options
 from daemon.config.schema import Config
 from daemon.health.faults import FAULTS
@@ -13,6 +13,7 @@ from daemon.health.reasons import REASONS
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.modbus import holding
 from daemon.snapshot import LightFix, LinkUse, LoopReason, State
+from daemon.system.console import FAILED, OK
 
 
 def _told(capsys: pytest.CaptureFixture[str], *words: str) -> str:

@@ -15,6 +15,7 @@ import pytest
 from daemon.cli import parser
 from daemon.config.paths import maps_folder
 from daemon.config.schema import Config
+from daemon.system import console
 
 ROOT = Path(__file__).parents[3]
 
@@ -22,12 +23,12 @@ ROOT = Path(__file__).parents[3]
 def test_check_good_and_bad(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "robot.toml"
     file.write_text("[modbus]\nport = 5020\n")
-    assert parser.main(["check", str(file)]) == parser.OK
+    assert parser.main(["check", str(file)]) == console.OK
     good, maps = capsys.readouterr().out.splitlines()
     assert good == f"{file}: good"
     assert maps == f"{maps_folder('')}: not there yet, maps will be kept in it"
     file.write_text("[modbus]\nport = 'x'\n")
-    assert parser.main(["check", str(file)]) == parser.USAGE
+    assert parser.main(["check", str(file)]) == console.USAGE
     assert capsys.readouterr().err.startswith(f'lumiloop: {file}:2: `modbus.port` = "')
 
 
@@ -48,26 +49,26 @@ def test_print_config_resolves_file_and_overrides(tmp_path: Path, capsys: pytest
     file = tmp_path / "robot.toml"
     file.write_text("name = 'r7'\n")
     words = ["run", "--config", str(file), "--lidar", "/dev/ttyACM1", "--set", "modbus.port=0", "--print-config"]
-    assert parser.main(words) == parser.OK
+    assert parser.main(words) == console.OK
     printed = tomllib.loads(capsys.readouterr().out)
     assert (printed["name"], printed["lidar"]["device"], printed["modbus"]["port"]) == ("r7", "/dev/ttyACM1", 0)
 
 
 @pytest.mark.parametrize("flag", ["--schema", "--reference", "--print-config", "--version"])
 def test_printed_facts(flag: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert parser.main([flag]) == parser.OK
+    assert parser.main([flag]) == console.OK
     assert capsys.readouterr().out.endswith("\n")
 
 
 def test_no_command_shows_help_as_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
-    assert parser.main([]) == parser.USAGE
+    assert parser.main([]) == console.USAGE
     assert "COMMAND" in capsys.readouterr().err
 
 
 def test_unknown_command_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         parser.main(["fly"])
-    assert caught.value.code == parser.USAGE
+    assert caught.value.code == console.USAGE
     assert "fly" in capsys.readouterr().err
 
 
@@ -97,7 +98,7 @@ def test_a_command_gets_the_settings_and_its_code_is_ours(monkeypatch: pytest.Mo
 
 def test_an_interrupt_is_not_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     _command(monkeypatch, KeyboardInterrupt())
-    assert parser.main(["replay", "x.log", "--out", "o"]) == parser.INTERRUPTED
+    assert parser.main(["replay", "x.log", "--out", "o"]) == console.INTERRUPTED
 
 
 INTERRUPTED_WHILE_LOADING = """

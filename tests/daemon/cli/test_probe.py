@@ -11,13 +11,14 @@ import msgspec
 import pytest
 
 from daemon.cli import probe
+from daemon.config import endpoints
 from daemon.config.schema import Config, PhotodiodeConfig
 from hal.bus.i2c import BusOpener
 from hal.errors import DeviceMissing, DeviceRefused
+from hal.hokuyo.probe import Finding
 from hal.photodiode.probe import BusFinding, Chip
 from hal.port.port import PortOpener
-from hal.probe import Finding
-from tests.daemon.room import URG
+from tests.daemon.support.room import URG
 
 LIDAR = Finding("/dev/ttyACM0", URG, "SOKUIKI Sensor URG-04LX", "SCIP 2.0", "Sensor works well.")
 NOTHING = Finding("/dev/ttyACM1", error=DeviceMissing("/dev/ttyACM1", "no such device", "plug it in"))
@@ -134,4 +135,4 @@ def test_programs_get_buses_as_json(monkeypatch: pytest.MonkeyPatch, capsys: pyt
      ("/dev/ttyACM0", False), ("tcp://192.168.0.10:10940", False)],
 )  # fmt: skip
 def test_names_of_buses(device: str, bus: bool) -> None:
-    assert probe.is_bus(device) is bus
+    assert endpoints.is_bus(device) is bus

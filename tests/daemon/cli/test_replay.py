@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.cli import parser
 from daemon.config.schema import Config, ModbusConfig
 from daemon.runtime import warmup
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import CycleRecord
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.runtime.worker import CycleWorker
+from daemon.system import console
 from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceFault
 from hal.replay.carmen import read_carmen
@@ -43,7 +44,7 @@ def log(run: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def out(log: Path) -> Path:
     folder = log.parent / "out"
-    assert parser.main(["replay", str(log), "--out", str(folder)]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(folder)]) == console.OK
     return folder
 
 
@@ -71,7 +72,7 @@ def test_the_trajectory_is_the_drive(out: Path, run: Drive) -> None:
 
 
 def test_two_replays_write_identical_bytes(log: Path, out: Path, tmp_path: Path) -> None:
-    assert parser.main(["replay", str(log), "--out", str(tmp_path)]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path)]) == console.OK
     for name in RESULTS - {"timing.json"}:
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes(), name
 
@@ -131,7 +132,7 @@ def test_the_log_as_a_device_of_the_daemon_gives_the_same_poses(log: Path, out: 
             warmup.load()
 
         clock = LoopClock(asyncio.get_running_loop())
-        world = World(
+        world = Environment(
             clock, make_lidar=lambda config, clock, opener: player.lidar, make_worker=CycleWorker,
             make_budget=FixedBudget, stopwatch=None, warm_up=warm, draw_map_id=lambda: 1,
         )  # fmt: skip
@@ -151,7 +152,7 @@ def test_the_log_as_a_device_of_the_daemon_gives_the_same_poses(log: Path, out: 
 
 
 def test_map_export_writes_the_same_map_alone(log: Path, out: Path, tmp_path: Path) -> None:
-    assert parser.main(["map", "export", str(log), "--out", str(tmp_path)]) == parser.OK
+    assert parser.main(["map", "export", str(log), "--out", str(tmp_path)]) == console.OK
     assert {file.name for file in tmp_path.iterdir()} == {"map.pgm", "map.yaml", "map.png"}
     for file in tmp_path.iterdir():
         assert file.read_bytes() == (out / file.name).read_bytes()
@@ -167,11 +168,11 @@ def test_the_logs_mount_counts_unless_a_person_gives_one(tmp_path: Path, run: Dr
         moved.append(" ".join(words))
     log = tmp_path / "mounted.log"
     log.write_text("\n".join(moved[:3]) + "\n")
-    assert parser.main(["replay", str(log), "--out", str(tmp_path / "a")]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path / "a")]) == console.OK
     assert summary_of(tmp_path / "a")["config"]["lidar"]["mount"]["x"] == pytest.approx(0.3, abs=1e-5)  # type: ignore[index]  # plain data
     for number in (0.1, 0.0):
         given = ["--set", f"lidar.mount.x={number}"]
-        assert parser.main(["replay", str(log), "--out", str(tmp_path / "b"), *given]) == parser.OK
+        assert parser.main(["replay", str(log), "--out", str(tmp_path / "b"), *given]) == console.OK
         assert summary_of(tmp_path / "b")["config"]["lidar"]["mount"]["x"] == number  # type: ignore[index]  # plain data
 
 
@@ -181,7 +182,7 @@ def test_stamps_that_run_backwards_stay_in_the_results(
     shuffled = Drive(run.truth[:30], run.odometry[:30], run.ranges[:30], run.stamps[:30].copy())
     shuffled.stamps[[10, 20]] -= 0.35
     log = carmen(tmp_path / "a.log", shuffled)
-    assert parser.main(["replay", str(log), "--out", str(tmp_path / "out")]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path / "out")]) == console.OK
     stamps, poses = read_tum(tmp_path / "out" / "trajectory.tum")
     order = np.argsort(shuffled.stamps, kind="stable")
     assert stamps == pytest.approx(shuffled.stamps[order], abs=1e-6)
@@ -203,7 +204,7 @@ def test_stamps_that_run_backwards_stay_in_the_results(
 def test_a_log_of_another_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes, says: str) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(content)
-    assert parser.main(["replay", str(path), "--out", str(tmp_path / "out")]) == parser.FAILED
+    assert parser.main(["replay", str(path), "--out", str(tmp_path / "out")]) == console.FAILED
     said = capsys.readouterr().err
     assert says in said
     assert str(path) in said
@@ -212,18 +213,18 @@ def test_a_log_of_another_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_a_missing_log_and_an_output_that_is_a_file(
     tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert parser.main(["replay", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == parser.FAILED
+    assert parser.main(["replay", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == console.FAILED
     assert "none: no such file (check the path)" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
-    assert parser.main(["replay", str(log), "--out", str(tmp_path / "file")]) == parser.FAILED
+    assert parser.main(["replay", str(log), "--out", str(tmp_path / "file")]) == console.FAILED
     assert "is a file; name a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("trouble", "code", "says"),
     [
-        (KeyboardInterrupt(), parser.INTERRUPTED, "interrupted"),
-        (DeviceFault("room.log", "the disk has gone", "plug it in"), parser.FAILED, "the disk has gone"),
+        (KeyboardInterrupt(), console.INTERRUPTED, "interrupted"),
+        (DeviceFault("room.log", "the disk has gone", "plug it in"), console.FAILED, "the disk has gone"),
     ],
 )
 def test_what_ends_a_replay_early_leaves_what_was_computed(
@@ -257,11 +258,11 @@ def test_what_ends_a_replay_early_leaves_what_was_computed(
 def test_a_capture_without_scans_is_no_success(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.logr"
     path.write_bytes(bytes(7) + b"\x05" + (6).to_bytes(4, "big") + b"VV\n00P")
-    assert parser.main(["replay", str(path), "--out", str(tmp_path / "out")]) == parser.FAILED
+    assert parser.main(["replay", str(path), "--out", str(tmp_path / "out")]) == console.FAILED
     assert "without a scan that gave a pose" in capsys.readouterr().err
 
 
 def test_the_real_capture_gives_its_poses(log_root: Path, tmp_path: Path) -> None:
     path = log_root / "scip" / "example_urg_04lx.logr"
-    assert parser.main(["replay", str(path), "--out", str(tmp_path)]) == parser.OK
+    assert parser.main(["replay", str(path), "--out", str(tmp_path)]) == console.OK
     assert summary_of(tmp_path)["counts"]["poses"] == summary_of(tmp_path)["counts"]["scans"] > 0  # type: ignore[operator]  # plain data

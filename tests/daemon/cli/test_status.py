@@ -18,8 +18,9 @@ from typing import Any
 import pytest
 
 from daemon.cli import status as cli_status
+from daemon.cli import status_table
 from daemon.config.schema import Config, ModbusConfig
-from daemon.publish.modbus import lights_block, registers
+from daemon.publish.modbus import client, lights_block, registers
 from daemon.snapshot import Snapshot, State
 from tests.daemon.publish.modbus.test_lights_block import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
@@ -160,22 +161,6 @@ def test_a_program_reads_the_links(capsys: pytest.CaptureFixture[str]) -> None:
     assert not [key for key in reading if key.startswith("link_")]
 
 
-def test_watching_goes_on_until_interrupted(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    naps = iter(range(3))
-
-    def nap(_: float) -> None:
-        if next(naps, None) is None:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
-    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
-        status(address, watch=True, json=True)
-    lines = capsys.readouterr().out.splitlines()
-    assert [json.loads(line)["stalled"] for line in lines] == [False, True, True, True]
-
-
 @contextmanager
 def stranger(block: bytes, head: bytes = b"\x00\x00\x00\x83\x01\x04\x80", silent: int = 0) -> Iterator[str]:
     """Something that answers every datagram with the same, but for the first few."""
@@ -204,7 +189,7 @@ def stranger(block: bytes, head: bytes = b"\x00\x00\x00\x83\x01\x04\x80", silent
 def test_a_lost_datagram_is_asked_for_again(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli_status, "_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(client, "_TIMEOUT_S", 0.1)
     with stranger(registers.encode_block(snapshot(reason=0, fault=0)), silent=2) as address:
         assert status(address) == 0
     assert "TRACKING" in capsys.readouterr().out
@@ -278,7 +263,7 @@ def test_whose_registers_are_shown_is_said(
 
 
 def test_silence(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli_status, "_TIMEOUT_S", 0.02)
+    monkeypatch.setattr(client, "_TIMEOUT_S", 0.02)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         assert status(f"127.0.0.1:{sock.getsockname()[1]}") == 1
@@ -322,85 +307,19 @@ def test_an_unknown_name(capsys: pytest.CaptureFixture[str]) -> None:
         assert "check the address" in capsys.readouterr().err
 
 
-def test_watching_shows_when_the_daemon_is_away(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    naps = iter(range(2))
-
-    def nap(_: float) -> None:
-        if next(naps, None) is None:
-            raise KeyboardInterrupt
-
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        port = sock.getsockname()[1]
-    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
-    with pytest.raises(KeyboardInterrupt):
-        status(f"127.0.0.1:{port}", watch=True)
-    assert capsys.readouterr().err.count("nothing serves Modbus there") == 1  # of three looks
-
-
-def test_watching_says_anew_what_is_new(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    away, refused = cli_status.NoAnswer("away"), cli_status.NoAnswer("refused")
-    looks = iter([away, away, refused, {"seq": 1}, refused])
-
-    def read(_: cli_status.Reader) -> Any:
-        look = next(looks, KeyboardInterrupt())
-        if isinstance(look, BaseException):
-            raise look
-        return look
-
-    monkeypatch.setattr(cli_status.Reader, "read", read)
-    monkeypatch.setattr("daemon.cli.status.time.sleep", lambda _: None)
-    monkeypatch.setattr("daemon.cli.status._show", lambda *_: None)
-    with pytest.raises(KeyboardInterrupt):
-        status("127.0.0.1:1", watch=True)
-    said = [line.removeprefix("lumiloop: ") for line in capsys.readouterr().err.splitlines()]
-    assert said == ["away; waiting", "refused; waiting", "refused; waiting"]
-
-
-def test_on_a_small_terminal_watching_keeps_the_first_lines(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def nap(_: float) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    monkeypatch.setattr("shutil.get_terminal_size", lambda *_: os.terminal_size((40, 8)))
-    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
-        status(address, watch=True)
-    lines = capsys.readouterr().out.removeprefix("\x1b[H\x1b[2J").splitlines()
-    assert lines[0] == "state      TRACKING"
-    assert len(lines) == 7  # and the cursor's
-    assert max(map(len, lines)) <= 40
-    assert lines[-1] == "... 9 more lines: a higher window"
-
-
-def test_on_a_terminal_watching_repaints(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def nap(_: float) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
-        status(address, watch=True)
-    assert capsys.readouterr().out.startswith("\x1b[H\x1b[2Jstate      TRACKING\n")
-
-
 def test_a_time_that_is_none_is_not_made_up() -> None:
     reading: Any = registers.decode_block(registers.encode_block(snapshot(reason=0, fault=0)))
-    assert "no time" in cli_status.as_table(reading | {"t_utc": None}, stalled=False)
-    assert cli_status.as_table(reading | {"t_utc": 2**64 / 1e6}, stalled=False), "the largest that can be sent"
+    assert "no time" in status_table.as_table(reading | {"t_utc": None}, stalled=False)
+    assert status_table.as_table(reading | {"t_utc": 2**64 / 1e6}, stalled=False), "the largest that can be sent"
 
 
 def test_an_age_or_a_sigma_at_the_end_of_its_register_may_be_any_larger() -> None:
     old = snapshot(reason=0, fault=0, t_sent=1300.0, covariance=(100.0, 0.0, 1e-4, 0.0, 0.0, 1e-4))
-    shown = cli_status.as_table(registers.decode_block(registers.encode_block(old)), stalled=False)
+    shown = status_table.as_table(registers.decode_block(registers.encode_block(old)), stalled=False)
     assert "age        > 6.5 s\n" in shown
     assert "sigma      > 6.5 m, 0.0100 m, 0.57 deg\n" in shown
 
 
 def test_a_state_of_a_newer_daemon_is_shown_by_number() -> None:
     reading: Any = registers.decode_block(registers.encode_block(snapshot(reason=0, fault=0))) | {"state": 99}
-    assert "unknown to this reader (99)" in cli_status.as_table(reading, stalled=False)
+    assert "unknown to this reader (99)" in status_table.as_table(reading, stalled=False)

@@ -13,10 +13,11 @@ import pytest
 from daemon.cli import parser
 from daemon.config import paths
 from daemon.diagnosis.moment import Moment
-from daemon.integrity.motion_consistency import Told
+from daemon.integrity.motion_consistency import MotionComparison
 from daemon.recording import disk_writer, flight_recorder
 from daemon.recording.disk_writer import SegmentWriter
 from daemon.recording.retention import DUMP
+from daemon.system import console
 from daemon.system.versions import build
 from estimator.mapping.occupancy_grid import Grid
 from hal.odometry import RawOdometry
@@ -67,7 +68,7 @@ def test_a_recording_that_is_not_open_to_this_user_is_said_to_be_so(
 
 @pytest.mark.parametrize(("wheels_m", "turn", "agree"), [(1.0, 0.0, True), (0.65, 0.0, False), (1.0, 0.4, False)])
 def test_witnesses_agree_within_slip(wheels_m: float, turn: float, agree: bool) -> None:
-    told = Told(2.0, np.array((1.0, 0.0, 0.0)), np.array((wheels_m, 0.0, turn)))
+    told = MotionComparison(2.0, np.array((1.0, 0.0, 0.0)), np.array((wheels_m, 0.0, turn)))
     assert told.agree is agree
     assert told.apart == pytest.approx((abs(1.0 - wheels_m), turn))
 
@@ -83,7 +84,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def asked(words: str, folder: Path, capsys: pytest.CaptureFixture[str], *options: str) -> str:
-    assert parser.main(["why", words, str(folder), *options]) == parser.OK
+    assert parser.main(["why", words, str(folder), *options]) == console.OK
     return capsys.readouterr().out
 
 
@@ -200,7 +201,7 @@ def test_a_picture_that_cannot_be_had_is_refused_before_anything_is_replayed(
     monkeypatch.setattr("daemon.cli.why.moments", lambda *_: pytest.fail("replayed"))
     with pytest.raises(SystemExit) as ended:
         parser.main(["why", "9", str(recorded), "--out", "why.xyz"])
-    assert ended.value.code == parser.USAGE
+    assert ended.value.code == console.USAGE
     assert "why.xyz: a picture ends with .png, .svg, .pdf" in capsys.readouterr().err
     (tmp_path / "file").touch()
     (tmp_path / "folder.png").mkdir()
@@ -208,11 +209,11 @@ def test_a_picture_that_cannot_be_had_is_refused_before_anything_is_replayed(
         ("file/why.png", "is a file; name a folder"),
         ("folder.png", "is a folder; name a file in it"),
     ):
-        assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / name)]) == parser.FAILED
+        assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / name)]) == console.FAILED
         assert problem in capsys.readouterr().err
     (tmp_path / "closed").mkdir()
     for name in (f"{248 * 'a'}.png", f"{300 * 'a'}.png"):  # of the first only that beside it is too long
-        assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / name)]) == parser.FAILED
+        assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / name)]) == console.FAILED
         assert f"cannot write {tmp_path / name}: File name too long; name another file" in capsys.readouterr().err
     is_dir = Path.is_dir
 
@@ -223,12 +224,12 @@ def test_a_picture_that_cannot_be_had_is_refused_before_anything_is_replayed(
 
     with monkeypatch.context() as there:  # tests may run as root, to whom all is open
         there.setattr(Path, "is_dir", closed)
-        assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / "closed" / "why.png")]) == parser.FAILED
+        assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / "closed" / "why.png")]) == console.FAILED
     assert f"cannot write {tmp_path}/closed/why.png: Permission denied; name another file" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["closed", "file", "folder.png"], "nothing stays"
     assert not list((tmp_path / "closed").iterdir())
     monkeypatch.setattr("daemon.cli.why.find_spec", lambda name: None)
-    assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / "why.png")]) == parser.FAILED
+    assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / "why.png")]) == console.FAILED
     assert "pictures need matplotlib" in capsys.readouterr().err
 
 
@@ -237,7 +238,7 @@ def test_for_a_time_that_is_none_no_folder_is_made(
 ) -> None:
     assert (
         parser.main(["why", "nonsense", str(recorded), "--out", str(tmp_path / "by" / "typo" / "a.png")])
-        == parser.FAILED
+        == console.FAILED
     )
     assert "not a time" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

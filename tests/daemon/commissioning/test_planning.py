@@ -19,6 +19,7 @@ from daemon.commissioning.laser_information import KNOWN_SIGMA_M, wall_informati
 from daemon.commissioning.light_information import Fitting, information, seen_from, told, worst
 from daemon.commissioning.plan_plot import draw
 from daemon.config.survey_loader import read_survey
+from daemon.system import console
 from estimator.light_filter.lambertian import Wrt, expected
 from estimator.light_filter.survey import Lamp, Receiver, Survey
 from estimator.paper.lateration import locate
@@ -154,7 +155,7 @@ def test_a_plan_that_falls_short_says_why(
     assert re.fullmatch(r"goal NOT reached: limit of 3 lamps; \d+\.\d % of the places where it could be", short)
     path = write_pgm(tmp_path, room(3.0, 3.0))
     words = ["plan", str(path), "--out", str(tmp_path / "plan"), "--lamps", "400", "--spacing", "1.0"]
-    assert parser.main(words) == parser.FAILED
+    assert parser.main(words) == console.FAILED
     said = capsys.readouterr()
     assert re.search(r"only \d+ spots", said.err)
     assert "lamps: " in said.out, "what was found is told and written"
@@ -197,7 +198,7 @@ def test_the_command_writes_a_survey_that_it_can_judge_again(
 ) -> None:
     path = write_pgm(tmp_path, room(6.0, 5.0))
     words = ["plan", str(path), "--out", str(tmp_path / "plan"), "--height", "3.0", "--lamps", "9", "--spacing", "0.8"]
-    assert parser.main(words) == parser.OK
+    assert parser.main(words) == console.OK
     said = capsys.readouterr().out
     assert "lamps: 9, one for every" in said
     survey = read_survey(tmp_path / "plan" / "lights.toml")
@@ -206,7 +207,7 @@ def test_the_command_writes_a_survey_that_it_can_judge_again(
     assert all(1.0 < lamp.x < 7.6 and -2.0 < lamp.y < 3.6 for lamp in survey.lamps), "in the map's frame"
     assert (tmp_path / "plan" / "plan.png").read_bytes().startswith(b"\x89PNG")
     judged = ["plan", str(path), "--out", str(tmp_path / "b"), "--survey", str(tmp_path / "plan" / "lights.toml")]
-    assert parser.main(judged) == parser.OK
+    assert parser.main(judged) == console.OK
     again = capsys.readouterr().out
     assert [line for line in said.splitlines() if line.startswith("laser and light")] == [
         line for line in again.splitlines() if line.startswith("laser and light")
@@ -277,7 +278,7 @@ def test_what_cannot_be_planned_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], text: str
 ) -> None:
     path = write_pgm(tmp_path, room(4.0, 3.0))
-    assert parser.main(["plan", str(path), "--out", str(tmp_path / "p"), *words]) != parser.OK
+    assert parser.main(["plan", str(path), "--out", str(tmp_path / "p"), *words]) != console.OK
     assert text in capsys.readouterr().err
 
 

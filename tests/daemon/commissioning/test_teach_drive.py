@@ -10,7 +10,8 @@ import pytest
 from daemon.cli import parser
 from daemon.config.loader import load
 from daemon.config.survey_loader import read_survey
-from tests.daemon.teachrun import record
+from daemon.system import console
+from tests.daemon.commissioning.recorded_drive import record
 from tools.sim.light.harness import BUS
 
 
@@ -19,7 +20,7 @@ from tools.sim.light.harness import BUS
 def test_a_recorded_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = record(tmp_path / "teach", 100.0)
     out = tmp_path / "lights.toml"
-    assert parser.main(["survey", str(tmp_path / "teach"), "--height", "2.9", "--out", str(out)]) == parser.OK
+    assert parser.main(["survey", str(tmp_path / "teach"), "--height", "2.9", "--out", str(out)]) == console.OK
     assert scene.light is not None
     placed = {f.code: at for f, at in zip(scene.light.ceiling.fixtures, scene.light.ceiling.placed, strict=True)}
     start = scene.drive.pose(np.zeros(1))[0]
@@ -33,10 +34,10 @@ def test_a_recorded_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert np.median(errors) < 0.1
     capsys.readouterr()
     better = tmp_path / "better.toml"
-    assert parser.main(["calibrate", str(tmp_path / "teach"), "--out", str(better)]) == parser.OK
+    assert parser.main(["calibrate", str(tmp_path / "teach"), "--out", str(better)]) == console.OK
     said = capsys.readouterr().out
     assert "not told by this drive" in said
     assert len(read_survey(better).lamps) == len(placed)
     wheels = ["--out", str(tmp_path / "robot.toml")]
-    assert parser.main(["calibrate", str(tmp_path / "teach"), "--odometry", "--lidar-mount", *wheels]) == parser.OK
+    assert parser.main(["calibrate", str(tmp_path / "teach"), "--odometry", "--lidar-mount", *wheels]) == console.OK
     assert load(tmp_path / "robot.toml").photodiode.bus == BUS

@@ -10,7 +10,7 @@ import pytest
 
 from daemon.config import loader
 from daemon.config.errors import problems
-from tests.daemon.refusing import refused
+from tests.daemon.config.refused import refused
 
 
 def test_a_refusal_says_what_the_key_is_for(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from daemon.config.endpoints import LidarPlace, RtuLine, parse_endpoint, parse_l
 from daemon.config.loader import ConfigError, load
 from daemon.config.schema import PROFILES, Config, LidarConfig, Mask, ModbusConfig, Mount, PoseConfig, parse_chip
 from estimator.cdma import air_interface
-from tests.daemon.refusing import refused
+from tests.daemon.config.refused import refused
 
 ROOT = Path(__file__).parents[3]
 

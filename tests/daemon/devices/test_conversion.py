@@ -19,8 +19,8 @@ from hal.adc import Blemish
 from hal.imu import RawImu
 from hal.lidar import VALID, LidarGeometry, RawScan
 from hal.odometry import RawOdometry
-from tests.daemon.lightroom import raw_block
-from tests.daemon.room import URG
+from tests.daemon.support.light_room import raw_block
+from tests.daemon.support.room import URG
 
 
 def scan_of(code: list[int], ranges: list[int], geometry: LidarGeometry = URG, first_step: int = 384) -> RawScan:

@@ -14,15 +14,15 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli import parser
 from daemon.cli.doctor import examine
 from daemon.diagnosis.host import Heard, Host, Mute
 from daemon.maps.store import Store
+from daemon.publish.stream.messages import Fault, Faults, Pose
+from daemon.system import console
 from hal.errors import DeviceFault
+from hal.hokuyo.probe import Finding
 from hal.lidar import LidarGeometry
 from hal.photodiode.probe import BusFinding, Chip
-from hal.probe import Finding
-from taps.stream.messages import Fault, Faults, Pose
 from tests.taps.serving import served
 
 ROOT = Path(__file__).parents[3]
@@ -108,7 +108,7 @@ def asked(file: Path | None, host: Host, *words: str, as_json: bool = False) -> 
 
 
 def test_where_all_is_well_nothing_has_to_be_fixed(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert asked(file, Computer()) == parser.OK
+    assert asked(file, Computer()) == console.OK
     said = capsys.readouterr().out
     assert said.endswith("nothing has to be fixed\n")
     assert "FIX" not in said
@@ -118,7 +118,7 @@ def test_where_all_is_well_nothing_has_to_be_fixed(file: Path, capsys: pytest.Ca
 
 def test_a_survey_that_is_not_there_is_named_with_its_line(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (file.parent / "lights.toml").unlink()
-    assert asked(file, Computer()) == parser.FAILED
+    assert asked(file, Computer()) == console.FAILED
     said = capsys.readouterr().out
     assert f"no such survey (`lumiloop survey` makes one from a drive) ({file}:4 names it: `lights.survey`)" in said
     assert "-> put it there, or name another; `lumiloop check` reads it again" in said
@@ -128,7 +128,7 @@ def test_a_survey_by_a_name_that_no_file_can_have_is_told_as_any_other(
     file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file.write_text(CONFIG.replace("lights.toml", "x" * 300))
-    assert asked(file, Computer()) == parser.FAILED
+    assert asked(file, Computer()) == console.FAILED
     assert re.search(r"FIX +survey", capsys.readouterr().out)
 
 
@@ -199,7 +199,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_broken_is_named_with_what_to_do(name: str, file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make, about, text, remedy = CASES[name]
-    assert asked(file, make(), as_json=True) == parser.FAILED
+    assert asked(file, make(), as_json=True) == console.FAILED
     found = json.loads(capsys.readouterr().out)
     wrong = [one for one in found if one["level"] == "fix"]
     assert any(one["about"] == about and text in one["text"] and remedy in one["remedy"] for one in wrong), wrong
@@ -207,7 +207,7 @@ def test_what_is_broken_is_named_with_what_to_do(name: str, file: Path, capsys: 
 
 
 def test_a_lamp_that_is_missing_is_not_in_view(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert asked(file, Computer(heard=ODD)) == parser.FAILED
+    assert asked(file, Computer(heard=ODD)) == console.FAILED
     assert "4 in view, 1 used" in capsys.readouterr().out
 
 
@@ -222,48 +222,48 @@ REMARKS = {
 @pytest.mark.parametrize("name", REMARKS)
 def test_what_works_worse_than_it_could_is_a_note(name: str, file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make, about, remedy = REMARKS[name]
-    assert asked(file, make(), as_json=True) == parser.OK
+    assert asked(file, make(), as_json=True) == console.OK
     found = json.loads(capsys.readouterr().out)
     assert any(f["about"] == about and f["level"] == "remark" and remedy in f["remedy"] for f in found)
 
 
 def test_the_first_to_fix_is_named_last(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert asked(file, Computer(ttys=[], room=0, ports={1502: errno.EADDRINUSE})) == parser.FAILED
+    assert asked(file, Computer(ttys=[], room=0, ports={1502: errno.EADDRINUSE})) == console.FAILED
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("4 to fix; first: disk: free some space")
 
 
 def test_files_that_are_wrong(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file.write_text(CONFIG + "lidar.devise = 3\n")
-    assert asked(file, Computer()) == parser.USAGE
+    assert asked(file, Computer()) == console.USAGE
     assert "devise" in capsys.readouterr().out
     file.write_text(CONFIG + 'map.folder = "lumiloop.toml"\n')
-    assert asked(file, Computer()) == parser.FAILED
+    assert asked(file, Computer()) == console.FAILED
     assert "is no folder" in capsys.readouterr().out
     (tmp_path / "lights.toml").write_text("lamp = 5")
     file.write_text(CONFIG)
-    assert asked(file, Computer()) == parser.FAILED
+    assert asked(file, Computer()) == console.FAILED
     assert re.search(r"FIX +survey", capsys.readouterr().out)
 
 
 def test_another_sensor_than_the_one_configured(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert asked(file, Computer(), "lidar.device=auto:H1") == parser.FAILED
+    assert asked(file, Computer(), "lidar.device=auto:H1") == console.FAILED
     assert "serial H0906091, configured is H1" in capsys.readouterr().out
 
 
 def test_lines_receivers_and_mounts_are_looked_at(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("modbus.serial=/dev/ttyS99@9600,8N1", 'pose.receivers=["nohost:5600", "*:5601"]', "lidar.mount.x=20")
-    assert asked(file, Computer(missing={"/dev/ttyS99"}), *words) == parser.FAILED
+    assert asked(file, Computer(missing={"/dev/ttyS99"}), *words) == console.FAILED
     said = capsys.readouterr().out
     assert re.search(r"FIX +modbus +/dev/ttyS99: not there", said)
     assert re.search(r"FIX +receivers +nohost:5600: Name or service not known", said)
     assert re.search(r"note +configuration +`lidar.mount.x` = 20: metres", said)
-    assert asked(file, Computer(), words[0]) == parser.OK
+    assert asked(file, Computer(), words[0]) == console.OK
 
 
 def test_a_folder_that_cannot_be_made_is_not_a_full_disk(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file.write_text(CONFIG + 'map.folder = "/proc/maps"\n')
-    assert asked(file, Computer(room=0)) == parser.FAILED
+    assert asked(file, Computer(room=0)) == console.FAILED
     said = capsys.readouterr().out
     assert "FIX  maps" in said
     assert "/proc/maps: cannot be made by this user" in said
@@ -288,10 +288,10 @@ def test_maps_are_judged_by_what_they_are_and_not_by_their_names(
     folder = tmp_path / "rooms that cannot be entered"
     folder.mkdir()
     file.write_text(f'{CONFIG}map.folder = "{folder}"\n')
-    assert asked(file, Computer()) == parser.OK
+    assert asked(file, Computer()) == console.OK
     assert re.search(r"good +maps +.*no map in it yet", capsys.readouterr().out)
     (folder / "00000001-1.lumimap").write_bytes(b"no map")
-    assert asked(file, Computer()) == parser.FAILED
+    assert asked(file, Computer()) == console.FAILED
     assert re.search(r"FIX +maps +.*no map in it can be used", capsys.readouterr().out)
 
 
@@ -355,7 +355,7 @@ def test_a_daemon_that_cannot_be_heard_is_there_all_the_same(
         def chips_on(self, bus: str) -> BusFinding:
             raise AssertionError("the daemon's bus was opened")
 
-    assert asked(file, Opened(heard=heard)) == parser.FAILED
+    assert asked(file, Opened(heard=heard)) == console.FAILED
     said = capsys.readouterr().out
     assert "1 to fix; first: daemon: sudo usermod" in said
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.cli import parser
 from daemon.cli.lamps import tell
 from daemon.config.schema import Config, MapConfig
 from daemon.diagnosis.host import Heard, Mute
@@ -19,10 +18,11 @@ from daemon.diagnosis.lamp_history import DAY_S, BadHistory, Look, by_lamp, in_m
 from daemon.diagnosis.lamp_trend import YEAR_S, Array, Finding, Verdict, judge, together
 from daemon.health.faults import Fault as Said
 from daemon.maps.image import meta_of, packed
+from daemon.publish.stream.messages import Fault, Faults
 from daemon.snapshot import LinkUse
-from taps.stream.messages import Fault, Faults
+from daemon.system import console
 from tests.daemon.diagnosis.test_doctor import Computer
-from tests.daemon.mapmaker import LAMPS, Shape, image
+from tests.daemon.support.map_maker import LAMPS, Shape, image
 
 NOW = 1.8e9
 RNG = np.random.default_rng(4)
@@ -175,7 +175,7 @@ def test_the_command_gathers_from_maps_and_remembers_them(tmp_path: Path, capsys
     assert len(in_maps(folder)) == 2 * len(LAMPS)
     dead = Faults(present=(Fault(fault=int(Said.LAMP_DEAD)),))
     host = Computer(t_utc=NOW, heard=Heard("agv", 1, faults=dead, lamps={(3, 4): int(LinkUse.MISSING)}))
-    assert tell(args(folder), host) == parser.FAILED
+    assert tell(args(folder), host) == console.FAILED
     told = json.loads(capsys.readouterr().out)
     assert (told[0]["lamp"], told[0]["finding"], told[0]["urgent"]) == (4, "dead", True)
     assert {one["lamp"] for one in told} == {lamp.lamp_id for lamp in LAMPS}
@@ -193,17 +193,17 @@ def test_a_passing_shadow_sends_nobody_to_a_lamp(tmp_path: Path, capsys: pytest.
     put_map(tmp_path / "maps", 1, NOW)
     odd = {(3, 4): int(LinkUse.REJECTED), (2, 3): int(LinkUse.MISSING)}
     heard = Heard("agv", 1, faults=Faults(present=(Fault(fault=int(Said.NO_LAMPS)),)), lamps=odd)
-    assert tell(args(tmp_path / "maps", json=False), Computer(t_utc=NOW, heard=heard)) == parser.OK
+    assert tell(args(tmp_path / "maps", json=False), Computer(t_utc=NOW, heard=heard)) == console.OK
     assert "no lamp is urgent" in capsys.readouterr().out
     heard.faults = Faults(present=(Fault(fault=int(Said.LAMP_MOVED)),))
-    assert tell(args(tmp_path / "maps", json=False), Computer(t_utc=NOW, heard=heard)) == parser.FAILED
+    assert tell(args(tmp_path / "maps", json=False), Computer(t_utc=NOW, heard=heard)) == console.FAILED
     assert capsys.readouterr().out.splitlines()[-1] == "go to: lamp 4"
 
 
 def test_that_no_daemon_was_heard_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Else `no lamp is urgent` would seem to be said of dead lamps, too."""
     put_map(tmp_path / "maps", 1, NOW)
-    assert tell(args(tmp_path / "maps"), Computer(t_utc=NOW)) == parser.OK
+    assert tell(args(tmp_path / "maps"), Computer(t_utc=NOW)) == console.OK
     told = capsys.readouterr()
     assert "dead or moved just now is not known, no daemon tells it: nobody listens there" in told.err
     assert json.loads(told.out)
@@ -212,12 +212,12 @@ def test_that_no_daemon_was_heard_is_said(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_where_nothing_is_known_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert tell(args(tmp_path / "maps"), Computer(t_utc=NOW)) == parser.FAILED
+    assert tell(args(tmp_path / "maps"), Computer(t_utc=NOW)) == console.FAILED
     assert "nothing is known of any lamp yet" in capsys.readouterr().err
     none = Config(map=MapConfig(folder="none"))
-    assert tell(args(tmp_path, settings=none), Computer()) == parser.USAGE
+    assert tell(args(tmp_path, settings=none), Computer()) == console.USAGE
     (tmp_path / "lamps.csv").write_text("x")
-    assert tell(args(tmp_path / "maps"), Computer()) == parser.FAILED
+    assert tell(args(tmp_path / "maps"), Computer()) == console.FAILED
     assert "is no history of lamps" in capsys.readouterr().err
     assert replace(Verdict(1, Finding.GOOD), lamp=2).urgent is False
 
@@ -225,6 +225,6 @@ def test_where_nothing_is_known_it_says_so(tmp_path: Path, capsys: pytest.Captur
 def test_it_makes_no_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     where = tmp_path / "none" / "lamps.csv"
     put_map(tmp_path / "maps", 1, NOW)
-    assert tell(args(tmp_path / "maps", history=where), Computer()) == parser.USAGE
+    assert tell(args(tmp_path / "maps", history=where), Computer()) == console.USAGE
     assert f"--history {where}: there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
     assert not where.parent.exists()

@@ -75,7 +75,7 @@ def test_a_cycle_that_begins_when_the_last_digit_turns_is_not_meant(digits: int)
 def test_what_is_judged_of_a_boundary_is_what_is_printed_of_it(begun: float) -> None:
     entry: Any = SimpleNamespace(state=int(State.DEGRADED), commands=(), reason=0, faults=(101,))
     record: Any = SimpleNamespace(t_mono=begun - AT, snapshot=NOTHING, result=None, scan=None, limits=None, dropped=())
-    cycle: Any = SimpleNamespace(observer=SimpleNamespace(witnesses=SimpleNamespace(told=lambda: None)))
+    cycle: Any = SimpleNamespace(observer=SimpleNamespace(motion_consistency=SimpleNamespace(compared=lambda: None)))
     one = moment_of(AT, entry, record, cycle)
     assert of_day(one.utc).endswith(":25.000")
     told = [replace(WELL, utc=AT + 4.5), one]

@@ -10,13 +10,14 @@ from typing import Any
 import pytest
 
 from daemon.cli import parser
-from daemon.cli.why import NoMoment, find, spans
+from daemon.diagnosis.recorded_spans import NoMoment, find, spans
 from daemon.diagnosis.utc import Part, parts
 from daemon.recording import disk_writer
 from daemon.recording.disk_writer import CLOCK, SegmentWriter
 from daemon.recording.retention import ABOUT
 from daemon.recording.state_file import write_state
 from daemon.replay.sources import RecordingSource
+from daemon.system import console
 from hal.errors import DeviceMissing
 from hal.replay.recording import SUFFIX, Kind, open_recording, pack_frame, pack_head, segment_name, state_name
 from tests.daemon.replay.test_dump import let_write
@@ -158,10 +159,10 @@ def test_a_clock_that_is_set_begins_a_segment_and_is_said(
     first, second = spans(run)
     assert second.utc_at_zero - first.utc_at_zero == pytest.approx(3.0, abs=1e-6)
     assert second.before_s == pytest.approx(4.0, abs=1.0)
-    assert parser.main(["replay", str(run), "--out", str(tmp_path / "out")]) == parser.OK
+    assert parser.main(["replay", str(run), "--out", str(tmp_path / "out")]) == console.OK
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["recorded_run"]["differ"] == 0
     capsys.readouterr()
-    assert parser.main(["why", f"{second.end - 1.0:.3f}", str(run)]) == parser.OK
+    assert parser.main(["why", f"{second.end - 1.0:.3f}", str(run)]) == console.OK
     head, remark, *_ = capsys.readouterr().out.splitlines()
     assert "the clock was set by +3.000 s, by " in remark
     at = time.strftime("%H:%M:%S", time.localtime(second.end - 1.0))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli.why import NoMoment, Span, find, meant, whole_second, width
+from daemon.diagnosis.recorded_spans import NoMoment, Span, find, meant, whole_second, width
 from tests.daemon.diagnosis.zones import BERLIN, local_time
 
 AT = datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC).timestamp()

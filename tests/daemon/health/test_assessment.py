@@ -12,6 +12,7 @@ import pytest
 
 from daemon.health.assessment import PUBLISHERS, Vitals, assess, describe
 from daemon.health.faults import FAULTS, Fault
+from daemon.health.present_faults import PresentFaults
 from daemon.health.report import NAMES
 from daemon.runtime import heartbeat as module
 from daemon.runtime.heartbeat import Heartbeat
@@ -151,15 +152,16 @@ class Patient:
 def test_a_fault_is_said_once_when_it_comes_and_once_when_it_has_gone(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     patient = Patient()
-    heart = Heartbeat(patient.sample, lambda: "statistics")
+    present = PresentFaults()
+    heart = Heartbeat(patient.sample, lambda: "statistics", present=present)
     heart.beat(0.0)
     patient.now = replace(patient.now, invalid=50)
     for _ in range(5):
         heart.beat(0.0)
-    assert heart.fault() == Fault.LIDAR_GARBLED
+    assert present.gravest() == Fault.LIDAR_GARBLED
     for _ in range(15):
         heart.beat(0.0)
-    assert heart.fault() == 0
+    assert present.gravest() == 0
     assert [record.message.split(" (")[0] for record in caplog.records] == [
         "fault 105: more than 5 % of the lidar's frames are damaged",
         "over: fault 105: more than 5 % of the lidar's frames are damaged; it lasted 10 s",

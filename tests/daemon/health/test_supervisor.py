@@ -16,14 +16,14 @@ from hal.errors import DeviceRefused
 
 
 def supervise(run: Callable[[], Awaitable[None]], seconds: float) -> tuple[Supervisor, bool]:
-    """Keep one part for some virtual time; whether its keeper ended by itself."""
+    """Keep one part for some virtual time; whether its autosaver ended by itself."""
 
     async def go() -> tuple[Supervisor, bool]:
         supervisor = Supervisor(random=Random(1))
-        keeper = asyncio.create_task(supervisor.keep("modbus", run))
+        autosaver = asyncio.create_task(supervisor.keep("modbus", run))
         await asyncio.sleep(seconds)
-        ended = keeper.done()
-        keeper.cancel()
+        ended = autosaver.done()
+        autosaver.cancel()
         return supervisor, ended
 
     return run_virtual(go())
@@ -112,11 +112,11 @@ def test_after_a_long_good_run_the_back_off_starts_anew() -> None:
 def test_cancelling_is_no_failure() -> None:
     async def go() -> Supervisor:
         supervisor = Supervisor()
-        keeper = asyncio.create_task(supervisor.keep("pose", asyncio.Event().wait))  # type: ignore[arg-type]  # waits
+        autosaver = asyncio.create_task(supervisor.keep("pose", asyncio.Event().wait))  # type: ignore[arg-type]  # waits
         await asyncio.sleep(1.0)
-        keeper.cancel()
+        autosaver.cancel()
         with pytest.raises(asyncio.CancelledError):
-            await keeper
+            await autosaver
         return supervisor
 
     supervisor = run_virtual(go())

@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 
 from daemon import app
-from daemon.environment import World
+from daemon.environment import Environment
 from daemon.health.assessment import Vitals
 from daemon.health.faults import Fault
+from daemon.health.present_faults import PresentFaults
 from daemon.health.report import Reporter
 from daemon.health.supervisor import Supervisor
-from daemon.health.thread_watch import COMPUTING_S, DISK_S, Answers
+from daemon.health.thread_watch import COMPUTING_S, DISK_S, ThreadWatch
 from daemon.runtime.heartbeat import Heartbeat
 from daemon.runtime.worker import URGENT, ThreadWorker
 from daemon.snapshot import Part, Thread
@@ -43,7 +44,7 @@ class Stand:
 def test_a_thread_that_hangs_is_said_once_each_way(thread: Thread, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     clock, since = Stand(), [None, 100.0, 100.0, 100.0, None]
-    answers = Answers(clock.now)
+    answers = ThreadWatch(clock.now)
     answers.watch(thread, lambda: since[0], DISK_S)
     for begun, later in zip(since, (0.0, 0.0, DISK_S + 1.0, 1.0, 1.0), strict=True):
         since[0], clock.t = begun, clock.t + later
@@ -55,7 +56,7 @@ def test_a_thread_that_hangs_is_said_once_each_way(thread: Thread, caplog: pytes
 def test_only_what_a_restart_cures_keeps_the_watchdog_hungry() -> None:
     for thread in Thread:
         clock = Stand()
-        answers = Answers(clock.now)
+        answers = ThreadWatch(clock.now)
         answers.watch(thread, lambda: 0.0, COMPUTING_S)
         clock.t = COMPUTING_S + 1.0
         assert answers.look() == {thread}
@@ -93,14 +94,14 @@ def test_a_worker_says_since_when_a_job_runs() -> None:
 
 
 def test_the_condition_is_one_object_until_something_changes(tmp_path: Path) -> None:
-    clock, supervisor, faults = Stand(), Supervisor(), [(Fault.LIDAR_SILENT,)]
+    clock, supervisor, present = Stand(), Supervisor(), PresentFaults((Fault.LIDAR_SILENT,))
     lidar = LidarStatus()
-    reporter = Reporter(clock, supervisor, Answers(clock.now), lambda: faults[0], (lidar, None))
+    reporter = Reporter(clock, supervisor, ThreadWatch(clock.now), present, (lidar, None))
     first = reporter()
     clock.t += 0.5
     assert reporter() is first
     assert (first.uptime_s, first.faults) == (0, (104,))
-    faults[0] = (Fault.LIDAR_SILENT, Fault.OVERRUNS)
+    present.faults = (Fault.LIDAR_SILENT, Fault.OVERRUNS)
     assert reporter().faults == (104, 302)
     lidar.reconnects, lidar.resyncs = 2, 3
     supervisor.restarts.update({"pose": 4, "something new": 1, "lidar": 1})
@@ -124,7 +125,7 @@ def test_background_work_that_hangs_is_a_fault_within_seconds_and_starves_the_wa
 
     async def run() -> None:
         clock = LoopClock(asyncio.get_running_loop())
-        daemon = app.Daemon(SETTINGS, World(clock, make_worker=ThreadWorker, draw_map_id=lambda: 1))
+        daemon = app.Daemon(SETTINGS, Environment(clock, make_worker=ThreadWorker, draw_map_id=lambda: 1))
         worker = daemon.cycle.parts.worker
         assert isinstance(worker, ThreadWorker)
         try:
@@ -140,7 +141,7 @@ def test_background_work_that_hangs_is_a_fault_within_seconds_and_starves_the_wa
                 fed.clear()
                 daemon.cycle.cycles += 1
                 daemon.heartbeat.beat(0.0)
-            assert daemon.answers.hanging == {thread}
+            assert daemon.threads.hanging == {thread}
             assert daemon.heartbeat.faults == (Fault.THREAD_HANGS,)
             assert "WATCHDOG=1" not in fed
         finally:

@@ -6,7 +6,7 @@ import pytest
 
 from daemon.integrity.arrival_monitor import Arrivals
 from daemon.runtime.inbox import DEEPEST, Inbox
-from tests.daemon.room import raw_odometry
+from tests.daemon.support.room import raw_odometry
 
 PERIOD = 0.1
 
@@ -16,7 +16,7 @@ def fed(*spells: tuple[float, float]) -> Arrivals:
     arrivals, t = Arrivals(), 0.0
     for seconds, hz in spells:
         for k in range(round(seconds * hz)):
-            arrivals.take(t + k / hz)
+            arrivals.on_reading(t + k / hz)
             if k % round(hz) == 0:
                 arrivals.seldom(t + k / hz, PERIOD)
         t += seconds
@@ -43,7 +43,7 @@ def test_readings_that_come_more_seldom_than_before(spells: tuple[tuple[float, f
 def test_wheels_that_are_slower_than_a_fast_lidar_are_no_fault(hz: float, period: float, seldom: bool) -> None:
     arrivals = Arrivals()
     for k in range(round(60.0 * hz)):
-        arrivals.take(k / hz)
+        arrivals.on_reading(k / hz)
         if k % round(hz) == 0 and k > 10.0 * hz:
             assert arrivals.seldom(k / hz, period) is seldom
 
@@ -58,7 +58,7 @@ def test_a_fast_sender_that_becomes_slow_is_noticed() -> None:
 
 def test_what_came_before_a_silence_says_nothing_of_the_rate_now() -> None:
     arrivals = fed((20.0, 50.0))
-    arrivals.take(25.0)
+    arrivals.on_reading(25.0)
     assert not arrivals.seldom(25.5, PERIOD)
     assert arrivals.latest == 25.0
 
@@ -70,7 +70,7 @@ def test_readings_that_wait_for_a_cycle_have_arrived_all_of_them() -> None:
         inbox.put_odometry(raw_odometry(0.01 * k))
         if k % 100 == 99:
             told.append(inbox.wheels.seldom(0.01 * k, 1.0))
-    assert len(inbox.take().odometry) <= DEEPEST
+    assert len(inbox.drain().odometry) <= DEEPEST
     assert not any(told)
     for k in range(4 * 40):
         inbox.put_odometry(raw_odometry(30.0 + k / 40))

@@ -12,7 +12,7 @@ from daemon.integrity.input_monitor import Watch
 from daemon.integrity.state_memory import Memory
 from daemon.snapshot import State
 from hal.odometry import RawOdometry
-from tests.daemon.room import raw_scan
+from tests.daemon.support.room import raw_scan
 
 PERIOD = 0.1
 

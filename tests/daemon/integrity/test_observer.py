@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from daemon.integrity.arrival_monitor import ODOMETRY_SILENT_S
 from daemon.integrity.evidence import VAGUE_M, Evidence
-from daemon.integrity.observer import ENOUGH_INLIERS, ODOMETRY_SILENT_S, OPENING_S, Observer, good
+from daemon.integrity.observer import ENOUGH_INLIERS, OPENING_S, Observer, good
 from estimator.measurements import Array, Command, Odometry, Order, Record
 from estimator.result import Loop, LoopReason, MatchResult, Reason, StepResult
 from hal.lidar import LidarStatus, Link

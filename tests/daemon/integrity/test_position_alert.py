@@ -18,7 +18,7 @@ from daemon.snapshot import State
 
 def run(alarm: Alarm, bounds: list[float | None], begin: float = 0.0) -> list[bool]:
     """One bound a tenth of a second."""
-    return [alarm.take(begin + 0.1 * k, bound) for k, bound in enumerate(bounds)]
+    return [alarm.update(begin + 0.1 * k, bound) for k, bound in enumerate(bounds)]
 
 
 def test_no_limit_no_alert() -> None:

@@ -9,7 +9,7 @@ from daemon.integrity.evidence import Evidence, Light
 from daemon.integrity.state_machine import judge
 from daemon.integrity.state_memory import DARK_S, Memory
 from daemon.snapshot import State
-from tests.daemon.judged import ALL, BAD, LIT, PERIOD, run, said, scans, seen
+from tests.daemon.integrity.judged_steps import ALL, BAD, LIT, PERIOD, run, said, scans, seen
 
 
 def lit(count: int = 40, light: Light = LIT, **more: object) -> Memory:

@@ -17,8 +17,8 @@ from daemon.maps.autosave import ADRIFT, EVERY_S, FIRST_S, FIXED, NO_FOLDER, NO_
 from daemon.maps.schema import read
 from daemon.maps.store import Start, Store
 from estimator.state import new_state
-from tests.daemon.keeping import Bench
-from tests.daemon.mapmaker import content
+from tests.daemon.maps.autosave_bench import Bench
+from tests.daemon.support.map_maker import content
 
 
 def test_saved_after_a_minute_then_every_five_and_only_if_something_has_changed(tmp_path: Path) -> None:
@@ -28,17 +28,17 @@ def test_saved_after_a_minute_then_every_five_and_only_if_something_has_changed(
         await bench.turn(FIRST_S - 1.0)
         assert bench.files == 0
         await bench.turn(1.0)
-        assert bench.keeper.saves == 1
+        assert bench.autosaver.saves == 1
         await bench.turn(2.0 * EVERY_S)
-        assert bench.keeper.saves == 1, "nothing has changed"
+        assert bench.autosaver.saves == 1, "nothing has changed"
         bench.drive()
         await bench.turn(0.0)
-        assert bench.keeper.saves == 2
+        assert bench.autosaver.saves == 2
         bench.drive()
         await bench.turn(EVERY_S - 1.0)
-        assert bench.keeper.saves == 2
+        assert bench.autosaver.saves == 2
         await bench.turn(1.0)
-        assert bench.keeper.saves == 3
+        assert bench.autosaver.saves == 3
 
     asyncio.run(run())
 
@@ -69,8 +69,8 @@ def test_done_is_said_when_it_is_on_the_disk(tmp_path: Path) -> None:
     async def run() -> None:
         bench = Bench(tmp_path)
         bench.drive()
-        bench.keeper.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
-        bench.keeper.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
+        bench.autosaver.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
+        bench.autosaver.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
         assert bench.told == []
         for _ in range(2):
             await bench.turn()
@@ -84,7 +84,7 @@ def test_done_is_said_when_it_is_on_the_disk(tmp_path: Path) -> None:
     [
         (lambda bench: setattr(bench, "state", None), NO_MAP),
         (lambda bench: setattr(bench, "state", new_state()), NO_MAP),
-        (lambda bench: bench.keeper.loaded(), ADRIFT),
+        (lambda bench: bench.autosaver.loaded(), ADRIFT),
     ],
 )
 def test_what_cannot_be_saved_is_refused_with_the_reason(
@@ -93,7 +93,7 @@ def test_what_cannot_be_saved_is_refused_with_the_reason(
     async def run() -> None:
         bench = Bench(tmp_path, start=Start(content(), read(content())))
         change(bench)
-        bench.keeper.ask(bench.told.append)
+        bench.autosaver.ask(bench.told.append)
         assert bench.told == [reason]
 
     asyncio.run(run())
@@ -106,9 +106,9 @@ def test_without_a_folder_and_for_localisation_only_it_is_refused(tmp_path: Path
             (Bench(tmp_path, about=About(localise=True)), FIXED),
         ):
             bench.drive()
-            bench.keeper.ask(bench.told.append)
+            bench.autosaver.ask(bench.told.append)
             await bench.turn(10.0 * EVERY_S)
-            await bench.keeper.finish()
+            await bench.autosaver.finish()
             assert bench.told == [reason]
             assert bench.files == 0
 
@@ -130,17 +130,17 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_tried_again(
 
         monkeypatch.setattr(bench.store, "save", full)
         bench.drive()
-        bench.keeper.ask(bench.told.append)
+        bench.autosaver.ask(bench.told.append)
         for _ in range(3):
             await bench.turn(RETRY_S)
         assert "Read-only file system" in bench.told[0]
-        assert "Read-only file system" in bench.keeper.error
+        assert "Read-only file system" in bench.autosaver.error
         assert caplog.text.count("the map cannot be saved") == 1
         monkeypatch.setattr(bench.store, "save", save)
         with caplog.at_level(logging.INFO):
             await bench.turn(RETRY_S)
-        assert bench.keeper.error == ""
-        assert bench.keeper.saves == 1
+        assert bench.autosaver.error == ""
+        assert bench.autosaver.saves == 1
         assert "map saved" in caplog.text
 
     asyncio.run(run())
@@ -152,13 +152,13 @@ def test_a_defect_in_the_packing_is_told_in_full_and_ends_nothing(
     async def run() -> None:
         bench = Bench(tmp_path)
         bench.drive()
-        monkeypatch.setattr(bench.keeper, "_packed", lambda image: 1 // 0)
+        monkeypatch.setattr(bench.autosaver, "_packed", lambda image: 1 // 0)
         await bench.turn(FIRST_S)
-        assert "ZeroDivisionError" in bench.keeper.error
+        assert "ZeroDivisionError" in bench.autosaver.error
         assert "Traceback" in caplog.text
         monkeypatch.undo()
         await bench.turn(RETRY_S)
-        assert bench.keeper.saves == 1
+        assert bench.autosaver.saves == 1
 
     asyncio.run(run())
 
@@ -177,18 +177,18 @@ def test_a_save_that_cannot_begin_is_told_and_tried_again(
             raise failure
 
         with monkeypatch.context() as without:
-            without.setattr(*((threading.Thread, "start") if str(failure) else (bench.keeper, "_image")), fail)
+            without.setattr(*((threading.Thread, "start") if str(failure) else (bench.autosaver, "_image")), fail)
             bench.drive()
             bench.state.map.keyframes[0] = None  # type: ignore[assignment]  # there is something of a map
-            bench.keeper.ask(bench.told.append)
+            bench.autosaver.ask(bench.told.append)
             bench.state.map.keyframes.clear()
         assert len(bench.told) == 1
         assert repr(failure) in bench.told[0]
-        assert repr(failure) in bench.keeper.error
-        assert bench.keeper.busy_since is None
+        assert repr(failure) in bench.autosaver.error
+        assert bench.autosaver.busy_since is None
         await bench.turn(RETRY_S)
-        assert bench.keeper.error == ""
-        assert bench.keeper.saves == 2, "begun anew, which must not be forgotten"
+        assert bench.autosaver.error == ""
+        assert bench.autosaver.saves == 2, "begun anew, which must not be forgotten"
 
     asyncio.run(run())
 
@@ -200,14 +200,14 @@ def test_reset_is_kept_at_once_so_that_the_old_map_does_not_come_back(tmp_path: 
         await bench.turn(FIRST_S)
         bench.state, bench.map_id = new_state(), 0x78
         await bench.turn(1.0)
-        assert bench.keeper.saves == 2
+        assert bench.autosaver.saves == 2
         start = Store(tmp_path).load()
         assert start is not None
         assert start.stored.meta.map_id == 0x78
         assert len(start.stored.tables["submap.key"]) == 0
         assert bench.files == 2, "the old one stays as a map of its own"
         await bench.turn(10.0 * EVERY_S)
-        assert bench.keeper.saves == 2
+        assert bench.autosaver.saves == 2
 
     asyncio.run(run())
 
@@ -218,12 +218,12 @@ def test_a_reset_that_could_not_be_kept_is_tried_again(tmp_path: Path, monkeypat
         bench.drive()
         await bench.turn(FIRST_S)
         bench.state, bench.map_id = new_state(), 0x78
-        packed = bench.keeper._packed
-        monkeypatch.setattr(bench.keeper, "_packed", lambda image: 1 // 0)
+        packed = bench.autosaver._packed
+        monkeypatch.setattr(bench.autosaver, "_packed", lambda image: 1 // 0)
         await bench.turn(1.0)
-        monkeypatch.setattr(bench.keeper, "_packed", packed)
+        monkeypatch.setattr(bench.autosaver, "_packed", packed)
         await bench.turn(RETRY_S)
-        assert bench.keeper.saves == 2
+        assert bench.autosaver.saves == 2
         assert bench.files == 2
 
     asyncio.run(run())
@@ -232,11 +232,11 @@ def test_a_reset_that_could_not_be_kept_is_tried_again(tmp_path: Path, monkeypat
 def test_a_map_just_loaded_is_not_saved_until_the_robot_knows_its_place_in_it(tmp_path: Path) -> None:
     async def run() -> None:
         bench = Bench(tmp_path, start=Start(content(), read(content())))
-        bench.keeper.loaded()
+        bench.autosaver.loaded()
         assert bench.state is not None
         bench.state.map.next_key += 9
         await bench.turn(EVERY_S)
-        await bench.keeper.finish()
+        await bench.autosaver.finish()
         assert bench.files == 0
         bench.drive()
         await bench.turn(EVERY_S)
@@ -255,10 +255,10 @@ def test_at_the_stop_what_is_new_is_saved_and_told_and_the_folder_is_free(
         bench.drive()
         caplog.clear()
         with caplog.at_level(logging.INFO):
-            await bench.keeper.finish()
+            await bench.autosaver.finish()
         assert caplog.text.count("map saved") == 1
         assert bench.files == 2
-        await bench.keeper.finish()
+        await bench.autosaver.finish()
         assert bench.files == 2
         Store(tmp_path).save(content(), 5)
 
@@ -272,8 +272,8 @@ def test_a_stop_does_not_wait_for_ever(
         bench = Bench(tmp_path)
         bench.drive()
         monkeypatch.setattr(autosave, "STOP_S", 0.1)
-        monkeypatch.setattr(bench.keeper, "_packed", lambda image: time.sleep(0.6))
-        await bench.keeper.finish()
+        monkeypatch.setattr(bench.autosaver, "_packed", lambda image: time.sleep(0.6))
+        await bench.autosaver.finish()
         assert "the one before stays" in caplog.text
         await asyncio.sleep(0.7)
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from daemon.maps.autosave import EVERY_S, FIRST_S, LOOK_S, RETRY_S, About, Keeper
+from daemon.maps.autosave import EVERY_S, FIRST_S, LOOK_S, RETRY_S, About, MapAutosaver
 from daemon.maps.store import Store
 from estimator.state import new_state
-from tests.daemon.keeping import Bench
+from tests.daemon.maps.autosave_bench import Bench
 
 
 def second(folder: Path) -> tuple[Store, Bench]:
@@ -30,10 +30,10 @@ def test_a_map_that_was_refused_is_a_fault_until_one_is_saved(tmp_path: Path) ->
         bench = Bench(tmp_path)
         assert bench.store is not None
         bench.store.load()
-        assert bench.keeper.refused
+        assert bench.autosaver.refused
         bench.drive()
         await bench.turn(FIRST_S)
-        assert not bench.keeper.refused
+        assert not bench.autosaver.refused
 
     asyncio.run(run())
 
@@ -43,19 +43,19 @@ def test_a_folder_of_another_process_is_a_fault_from_the_start_until_a_save_is_d
 ) -> None:
     async def run() -> None:
         other, bench = second(tmp_path)
-        keeper = Keeper(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
-        assert keeper.fault
-        bench.keeper = keeper
+        autosaver = MapAutosaver(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
+        assert autosaver.fault
+        bench.autosaver = autosaver
         bench.drive()
         await bench.turn(FIRST_S)
-        assert keeper.fault
+        assert autosaver.fault
         assert caplog.text.count("another process keeps its maps there") == 1
-        await keeper.finish()
+        await autosaver.finish()
         assert "it is tried again" not in caplog.text
         other.close()
         bench.drive()
         await bench.turn(RETRY_S)
-        assert not keeper.fault
+        assert not autosaver.fault
         assert bench.files == 1
 
     asyncio.run(run())
@@ -71,19 +71,21 @@ def test_a_folder_that_has_become_free_is_no_fault_any_more_though_there_is_noth
         bench = Bench(tmp_path, state=new_state() if loaded else None)
         assert bench.store is not None
         bench.store.claim()
-        bench.keeper = keeper = Keeper(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
+        bench.autosaver = autosaver = MapAutosaver(
+            bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock
+        )
         for _ in range(3):
             await bench.turn(LOOK_S)
-            assert keeper.fault
+            assert autosaver.fault
         assert caplog.text.count("another process keeps its maps there") == 1
         other.close()
         await bench.turn(LOOK_S)
-        assert not keeper.fault
-        assert (bench.files, keeper.busy_since) == (0, None)
+        assert not autosaver.fault
+        assert (bench.files, autosaver.busy_since) == (0, None)
         third = Store(tmp_path)
         third.claim()
         assert "another process" in third.trouble, "it is ours now"
-        await keeper.finish()
+        await autosaver.finish()
 
     with caplog.at_level(logging.INFO):
         asyncio.run(run())
@@ -97,18 +99,18 @@ def test_what_is_wrong_with_the_folder_may_change(tmp_path: Path) -> None:
         bench = Bench(folder)
         assert bench.store is not None
         bench.store.claim()
-        bench.keeper = Keeper(bench.store, None, lambda: None, lambda: 0x77, About(), bench.clock)
-        first = bench.keeper.error
+        bench.autosaver = MapAutosaver(bench.store, None, lambda: None, lambda: 0x77, About(), bench.clock)
+        first = bench.autosaver.error
         folder.unlink()
         other = Store(folder)
         other.claim()
         await bench.turn(LOOK_S)
-        assert bench.keeper.error not in ("", first)
-        assert "another process" in bench.keeper.error
+        assert bench.autosaver.error not in ("", first)
+        assert "another process" in bench.autosaver.error
         other.close()
         await bench.turn(LOOK_S)
-        assert bench.keeper.error == ""
-        await bench.keeper.finish()
+        assert bench.autosaver.error == ""
+        await bench.autosaver.finish()
 
     asyncio.run(run())
 
@@ -127,15 +129,15 @@ def test_a_save_that_was_asked_for_and_failed_is_tried_again_though_nothing_is_n
 
         with monkeypatch.context() as without:
             without.setattr(bench.store, "save", full)
-            bench.keeper.ask(bench.told.append)
+            bench.autosaver.ask(bench.told.append)
             await bench.turn()
             await bench.turn(RETRY_S)
-        assert bench.keeper.fault
+        assert bench.autosaver.fault
         await bench.turn(RETRY_S)
-        assert not bench.keeper.fault
-        assert bench.keeper.saves == 2
+        assert not bench.autosaver.fault
+        assert bench.autosaver.saves == 2
         await bench.turn(10.0 * EVERY_S)
-        assert bench.keeper.saves == 2
+        assert bench.autosaver.saves == 2
 
     asyncio.run(run())
 
@@ -148,7 +150,7 @@ def test_at_the_stop_what_there_is_is_saved_though_the_folder_has_not_been_looke
         other.close()
         bench.drive()
         bench.clock.t += LOOK_S
-        await bench.keeper.finish()
+        await bench.autosaver.finish()
         assert bench.files == 1
 
     asyncio.run(run())

@@ -17,7 +17,7 @@ from daemon.maps.image import image_from, in_m, in_mm, meta_of, packed
 from daemon.maps.schema import KINDS, OtherBuilding, against_survey, digest_of, lamps_of, parts, read, summary
 from estimator.light_filter.survey import Survey
 from estimator.mapping.map_snapshot import MapImage
-from tests.daemon.mapmaker import LAMPS, SURVEY, Shape, content, image
+from tests.daemon.support.map_maker import LAMPS, SURVEY, Shape, content, image
 
 FROZEN = Path(__file__).parent / "data" / "version-1.lumimap"
 """Written by the code of version 1; never written again."""

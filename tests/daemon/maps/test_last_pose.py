@@ -32,7 +32,7 @@ def kept(folder: Path, *snapshots: Snapshot) -> LastPose:
     pose = LastPose(folder)
     pose.start()
     for snapshot in snapshots:
-        pose.take(snapshot)
+        pose.on_snapshot(snapshot)
     pose.close()
     return LastPose(folder)
 
@@ -52,13 +52,13 @@ def test_the_pose_of_one_run_is_known_to_the_next(tmp_path: Path) -> None:
 def test_what_has_not_moved_is_not_written_and_what_moves_is_written_a_few_times_a_second(tmp_path: Path) -> None:
     pose = LastPose(tmp_path)
     for k in range(1000):
-        pose.take(at(0.025 * k, 1.0 + 0.001 * (k % 3)))
+        pose.on_snapshot(at(0.025 * k, 1.0 + 0.001 * (k % 3)))
     assert pose._number == 1
     for k in range(1000):
-        pose.take(at(25.0 + 0.025 * k, 1.0 + 0.02 * k))
+        pose.on_snapshot(at(25.0 + 0.025 * k, 1.0 + 0.02 * k))
     assert pose._number == pytest.approx(1 + 25.0 / WRITE_S, abs=20)
     before = pose._number
-    pose.take(at(60.0, 1.0, map_id=9))
+    pose.on_snapshot(at(60.0, 1.0, map_id=9))
     assert pose._number == before + 1
 
 
@@ -98,14 +98,14 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_tried_again(
     pose = LastPose(file / "maps")
     pose.start()
     for k in range(5):
-        pose.take(at(float(k), float(k)))
+        pose.on_snapshot(at(float(k), float(k)))
         time.sleep(0.02)
     end = time.monotonic() + 5.0
     while not pose.error and time.monotonic() < end:
         time.sleep(0.01)
     assert "Not a directory" in pose.error
     file.unlink()
-    pose.take(at(9.0, 9.0))
+    pose.on_snapshot(at(9.0, 9.0))
     pose.close()
     assert LastPose(file / "maps").of_map(7) == (9.0, 2.0, 0.5)
     assert [record.levelname for record in caplog.records] == ["INFO", "INFO"]
@@ -147,7 +147,7 @@ def test_a_robot_that_stands_has_its_pose_written_again_after_a_failure(
     pose = LastPose(tmp_path)
     pose.start()
     failing.set()
-    pose.take(at(0.0, 1.0))
+    pose.on_snapshot(at(0.0, 1.0))
     wait_for(lambda: pose.error)
     time.sleep(0.1)  # several retries fail
     assert not synced.is_set()

@@ -18,10 +18,10 @@ from estimator.mapping.map_parts import Trial
 from estimator.relocalisation import unaligned_map
 from estimator.relocalisation.hypothesis_tracking import Seek
 from estimator.result import Loop, LoopReason, StepResult
-from tests.daemon.keeping import Bench
-from tests.daemon.mapmaker import Shape, content
+from tests.daemon.maps.autosave_bench import Bench
 from tests.daemon.runtime.test_cycle import Bench as Cycling
 from tests.daemon.runtime.test_cycle import on_bench
+from tests.daemon.support.map_maker import Shape, content
 
 NOW = StepResult(1.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.ones(3), None, -1, None, 0, np.zeros(3), 0)
 ASIDE = replace(NOW, aside=True)
@@ -71,17 +71,17 @@ def test_a_map_set_aside_is_not_saved_over_and_what_follows_it_has_a_file_of_its
         assert state is not None
         first = max(state.map.graph.submaps)
         state.map.parts.detached, since = first, state.map.graph.submaps[first].first
-        bench.keeper.loaded()
+        bench.autosaver.loaded()
         unaligned_map.set_aside(state, Trial(first=first, since=since), 0.0, Seek())
         state.map.next_key += 30
         await bench.turn(FIRST_S)
         await bench.turn(2.0 * EVERY_S)
-        assert bench.keeper.saves == 0
-        bench.keeper.ask(bench.told.append)
+        assert bench.autosaver.saves == 0
+        bench.autosaver.ask(bench.told.append)
         assert bench.told == [ADRIFT]
         state.map.parts.aside, bench.map_id = None, 0x78
         await bench.turn(1.0)
-        assert bench.keeper.saves == 1
+        assert bench.autosaver.saves == 1
         assert old.read_bytes() == stored
         ids = sorted(one.map_id for one in Store(tmp_path).generations())
         assert ids == [0x77, 0x78]

@@ -11,19 +11,20 @@ from pathlib import Path
 
 import pytest
 
-from daemon import app
-from daemon.app import Daemon, Pacemaker, World
+from daemon.app import Daemon, Environment, Pacemaker
 from daemon.config.schema import MapConfig
 from daemon.maps import autosave, start_trial
+from daemon.maps.initial_state import started
 from daemon.maps.start_trial import MOST, NAME, PROOF_S
-from daemon.maps.store import Start, started
+from daemon.maps.store import Start
+from daemon.runtime import estimator_runner
 from daemon.runtime.warmup import CannotLoad
 from hal.clock import LoopClock, run_virtual
-from hal.fake.transport import FakeOpener
-from tests.daemon.keeping import Bench
-from tests.daemon.mapmaker import Shape, content
+from hal.fake.transport.memory_host import FakeOpener
+from tests.daemon.maps.autosave_bench import Bench
 from tests.daemon.maps.test_store import name, names, store_with
 from tests.daemon.scenarios.test_daemon import SETTINGS
+from tests.daemon.support.map_maker import Shape, content
 
 
 def begin(folder: Path, lasts: bool = False, ends: bool = False) -> Start | None:
@@ -143,7 +144,7 @@ def test_a_daemon_that_dies_at_once_goes_through_them_and_leaves_no_map(
         async def run() -> None:
             clock = LoopClock(asyncio.get_running_loop(), utc_at_zero=1.7e9)
             opener = FakeOpener(clock)
-            await Daemon(SETTINGS, World(clock, opener=opener, store=store, start=start)).run(asyncio.Event())
+            await Daemon(SETTINGS, Environment(clock, opener=opener, store=store, start=start)).run(asyncio.Event())
 
         with pytest.raises(ZeroDivisionError):
             run_virtual(run())
@@ -176,10 +177,10 @@ def test_only_a_start_that_has_come_to_its_map_counts(
 
     async def go() -> None:
         clock = LoopClock(asyncio.get_running_loop(), utc_at_zero=1.7e9)
-        world = World(clock, opener=FakeOpener(clock), warm_up=warm_up, store=store, start=start)
+        world = Environment(clock, opener=FakeOpener(clock), warm_up=warm_up, store=store, start=start)
         await Daemon(SETTINGS, world).run(asyncio.Event())
 
-    monkeypatch.setattr(app, "new_state", ended)
+    monkeypatch.setattr(estimator_runner, "new_state", ended)
     with pytest.raises(CannotLoad):
         run_virtual(go())
     assert (tmp_path / NAME).exists() is counts
@@ -235,8 +236,8 @@ def test_a_run_is_proved_when_it_has_lasted(tmp_path: Path, monkeypatch: pytest.
         bench.store.claim()
         bench.store.load()
         bench.store.trial.begin()
-        bench.keeper.loaded()
-        beats = asyncio.create_task(bench.keeper.run())
+        bench.autosaver.loaded()
+        beats = asyncio.create_task(bench.autosaver.run())
         bench.clock.t += PROOF_S - 0.1
         await asyncio.sleep(0.1)
         assert (tmp_path / NAME).exists()
@@ -258,9 +259,9 @@ def test_a_stop_in_order_does_not_count_and_a_defect_does_and_saves_nothing(tmp_
         bench.store.claim()
         bench.store.load()
         bench.store.trial.begin()
-        bench.keeper.loaded()
+        bench.autosaver.loaded()
         bench.drive()
-        await bench.keeper.finish(in_order)
+        await bench.autosaver.finish(in_order)
         assert json.loads((tmp_path / NAME).read_bytes())["count"] == (0 if in_order else 1)
         assert (len(names(tmp_path)) > 1) is in_order
 

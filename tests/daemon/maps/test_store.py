@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import errno
 import logging
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from daemon.config.paths import maps_folder
 from daemon.config.schema import MapConfig
-from daemon.maps import store as module
+from daemon.devices.light_setup import Lights
 from daemon.maps.container import Damaged
+from daemon.maps.initial_state import NoMap, new_state, recorded_start, started
 from daemon.maps.schema import digest_of
-from daemon.maps.store import NEWEST, OTHERS, NoMap, Store, recorded_start, started
-from daemon.runtime.light_setup import Lights, new_state
+from daemon.maps.store import NEWEST, OTHERS, Store
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.light_filter.survey import Survey
-from tests.daemon.mapmaker import LAMPS, SURVEY, Shape, content
+from tests.daemon.support.map_maker import LAMPS, SURVEY, Shape, content
 
 MAP = 0x1234
 
@@ -203,68 +200,6 @@ def test_a_torn_map_is_kept_aside_whole(tmp_path: Path, caplog: pytest.LogCaptur
     assert "2 of its submaps are joined with the rest by nothing and are left out" in caplog.text
 
 
-def test_one_process_at_a_time(tmp_path: Path) -> None:
-    first = store_with(tmp_path, 1)
-    with pytest.raises(BlockingIOError) as caught:
-        Store(tmp_path).save(content(), MAP)
-    assert "another process" in module.said(caught.value)
-    first.close()
-    Store(tmp_path).save(content(), MAP)
-
-
-def test_a_folder_that_vanished_is_made_again(tmp_path: Path) -> None:
-    store = store_with(tmp_path / "maps", 1)
-    for path in (tmp_path / "maps").iterdir():
-        path.unlink()
-    (tmp_path / "maps").rmdir()
-    store.save(content(), MAP)
-    assert Store(tmp_path / "maps").load() is not None
-
-
-def test_what_a_killed_process_has_left_half_written_goes(tmp_path: Path) -> None:
-    (tmp_path / f".{name(4)}.part").write_bytes(b"half")
-    store_with(tmp_path, 1)
-    assert names(tmp_path) == [name(1)]
-
-
-def test_a_full_disk_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = store_with(tmp_path, 1)
-
-    def full(handle: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        store.save(content(seed=2), MAP)
-    assert names(tmp_path) == [name(1)]
-
-
-def test_a_disk_that_keeps_lying_is_not_filled_with_what_it_has_spoilt(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = store_with(tmp_path, 1)
-    write = module.write_whole
-    monkeypatch.setattr(module, "write_whole", lambda path, data: write(path, data[:-50] + bytes(50)))
-    for _ in range(module.MOST_BROKEN + 3):
-        with pytest.raises(Damaged, match="the disk is failing"):
-            store.save(content(seed=2), MAP)
-    last = 1 + module.MOST_BROKEN + 3
-    kept = [name(k, more=".broken") for k in range(last - module.MOST_BROKEN + 1, last + 1)]
-    assert names(tmp_path) == [name(1), *kept]
-
-
-def test_a_disk_that_lies_is_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = store_with(tmp_path, 1)
-    write = module.write_whole
-    monkeypatch.setattr(module, "write_whole", lambda path, data: write(path, data[:-50] + bytes(50)))
-    with pytest.raises(Damaged, match="the disk is failing"):
-        store.save(content(seed=2), MAP)
-    assert names(tmp_path) == [name(1), name(2, more=".broken")]
-    start = Store(tmp_path).load()
-    assert start is not None
-    assert start.content == content(seed=1)
-
-
 def test_a_map_that_is_to_be_used_as_it_is_has_to_be_there(tmp_path: Path) -> None:
     config = MapConfig(folder=str(tmp_path), localise=True)
     with pytest.raises(NoMap, match=f"{tmp_path}: holds no map that can be used") as caught:
@@ -286,66 +221,6 @@ def test_a_recorded_map_must_be_the_one_that_the_run_began_with(tmp_path: Path) 
     path.write_bytes(content())
     with pytest.raises(Damaged, match=r"start\.lumimap is not the map"):
         recorded_start(path, "0" * 64, None)
-
-
-def test_maps_are_kept_in_the_state_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    assert maps_folder("") == tmp_path / "maps"
-    assert maps_folder("/srv/maps") == Path("/srv/maps")
-
-
-def test_a_second_daemon_on_one_folder_is_told_at_its_start(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    settings = MapConfig(folder=str(tmp_path))
-    first, _ = started(settings, None)
-    assert first is not None
-    assert not caplog.messages
-    second, _ = started(settings, None)
-    assert second is not None
-    assert "another process" in second.trouble
-    assert f"no map can be kept in {tmp_path}: another process keeps its maps there" in caplog.text
-    first.close()
-    caplog.clear()
-    started(settings, None)
-    assert not caplog.messages
-
-
-def test_what_a_killed_run_has_left_and_cannot_be_removed_keeps_nobody_from_the_folder(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    stuck, half = tmp_path / f".{name(1)}.part", tmp_path / f".{name(2)}.part"
-    stuck.mkdir()  # refuses to be unlinked, as another user's file in a sticky folder does
-    half.write_bytes(b"half")
-    store = Store(tmp_path)
-    store.claim()
-    assert store.trouble == ""
-    assert not half.exists()
-    assert caplog.text.count(f"{stuck} cannot be removed") == 1
-    store.claim()
-    assert caplog.text.count(f"{stuck} cannot be removed") == 1
-
-
-def test_a_folder_that_is_back_with_what_was_in_it_is_no_trouble_any_more(tmp_path: Path) -> None:
-    folder, away = tmp_path / "maps", tmp_path / "away"
-    store = Store(folder)
-    store.claim()
-    folder.rename(away)
-    folder.write_text("no folder")
-    store.claim()
-    assert store.trouble
-    folder.unlink()
-    away.rename(folder)
-    store.claim()
-    assert store.trouble == ""
-
-
-def test_a_folder_that_cannot_be_read_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    file = tmp_path / "file"
-    file.write_text("")
-    store = Store(file)
-    with caplog.at_level(logging.ERROR):
-        assert store.load() is None
-    assert f"maps in {file} cannot be read: Not a directory; mend that, or name another `map.folder`" in caplog.text
-    assert store.refused
 
 
 def test_a_map_that_somebody_has_put_there_is_loaded_where_there_is_no_other_and_never_removed(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def kill(folder: Path, kills: int, seed: int) -> dict[str, int]:
-    command = [sys.executable, "-m", "tests.daemon.killsave", str(folder), str(kills), str(seed)]
+    command = [sys.executable, "-m", "tests.daemon.maps.killed_saves", str(folder), str(kills), str(seed)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1700.0, check=False)
     assert done.returncode == 0, done.stderr
     found: dict[str, int] = json.loads(done.stdout)

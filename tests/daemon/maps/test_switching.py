@@ -14,19 +14,21 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.cli import parser
 from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig
 from daemon.maps import switching
-from daemon.maps.autosave import About, Keeper
+from daemon.maps.autosave import About, MapAutosaver
 from daemon.maps.container import pack, unpack
+from daemon.maps.initial_state import started
 from daemon.maps.schema import read
-from daemon.maps.store import Store, started, unjudged
+from daemon.maps.store import Store, unjudged
 from daemon.maps.switching import Maps, MapSwitch
 from daemon.recording.recorder import Recorder
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
+from daemon.system import console
 from estimator.mapping.map_snapshot import MapImage
 from estimator.numerics import se2
 from estimator.stored_map import restored
@@ -34,10 +36,10 @@ from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01
 from hal.fake.lidar.scan_world import Room
-from hal.fake.transport import FakeOpener
-from tests.daemon.mapmaker import content
+from hal.fake.transport.memory_host import FakeOpener
 from tests.daemon.replay.test_recorded_run import assert_the_same
 from tests.daemon.scenarios.test_imported_map import DEVICE, MOVED, draw, warm
+from tests.daemon.support.map_maker import content
 
 FIRST, SECOND = 0x1000, 0x2000
 BAD_SESSION = 77
@@ -50,13 +52,13 @@ def folder_of_two(folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[Pat
     ids = []
     for moved in (False, True):
         before = set(maps.glob("*.lumimap"))
-        assert parser.main(["map", "import", drawing, "--set", setting]) == parser.OK
+        assert parser.main(["map", "import", drawing, "--set", setting]) == console.OK
         (path,) = set(maps.glob("*.lumimap")) - before
         ids.append(int(path.name.split("-")[1], 16))
         if moved:
             points = se2.apply(MOVED, np.array([(0.0, 0.0), (7.0, 3.5)]))
             words = [f"--point=0,0={points[0, 0]},{points[0, 1]}", f"--point=7,3.5={points[1, 0]},{points[1, 1]}"]
-            assert parser.main(["map", "align", str(path), *words]) == parser.OK
+            assert parser.main(["map", "align", str(path), *words]) == console.OK
             ids[1] = int(capsys.readouterr().out.split()[-1], 16)
     return maps, ids[0], ids[1]
 
@@ -76,7 +78,7 @@ class Bench:
         opener.plug(DEVICE, FakeHokuyo(URG_04LX_UG01, Room(URG_04LX_UG01)))
         store, start = started(self.settings.map, None)
         recorder = Recorder(self.recording, self.settings, clock, start=start)
-        world = World(
+        world = Environment(
             clock,
             opener=opener,
             make_worker=CycleWorker,
@@ -145,7 +147,7 @@ def test_the_robot_goes_on_in_another_map_and_the_replay_repeats_it(
     assert posed[-1].jumps > posed[at - 1].jumps
     saved = [one for one in Store(maps).generations() if one.map_id == second]
     assert (len(saved) == 2) is not localise, "the map in use is saved before it is left"
-    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]) == parser.OK
+    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]) == console.OK
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert_the_same(summary, bench.daemon.cycle.cycles)
 
@@ -203,13 +205,13 @@ def test_a_map_that_nothing_can_be_begun_with_is_moved_aside_and_the_one_before_
     else:
         assert len(ids) == 1
         assert ids.isdisjoint({first}), "the new map does not take its ID"
-    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]) == parser.OK
+    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]) == console.OK
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert_the_same(summary, bench.daemon.cycle.cycles)
 
 
 class Quiet:
-    """A keeper that has nothing to save, or cannot."""
+    """An autosaver that has nothing to save, or cannot."""
 
     def __init__(self, reason: str = "", ready: bool = True) -> None:
         self.ready, self.map_id, self._reason = ready, FIRST, reason
@@ -218,15 +220,15 @@ class Quiet:
         told(self._reason)
 
 
-def asked(store: Store | None, keeper: Quiet, **maps: Any) -> str:
+def asked(store: Store | None, autosaver: Quiet, **maps: Any) -> str:
     """The end of one order, without a daemon."""
 
     async def go() -> str:
         made = Maps(store, unjudged, maps.pop("make", lambda start: start), **maps)
-        switch = MapSwitch(made, keeper, lambda _, taken: taken())  # type: ignore[arg-type]  # all that is asked of it
+        switch = MapSwitch(made, autosaver, lambda _, taken: taken())  # type: ignore[arg-type]  # all that is asked of it
         ended: list[str] = []
         switch.ask(SECOND, ended.append)
-        if store is not None and keeper.ready:
+        if store is not None and autosaver.ready:
             switch.ask(SECOND, ended.append)
             assert ended.pop() == switching.BUSY
         while not ended:  # noqa: ASYNC110 - a thread ends it
@@ -260,11 +262,11 @@ def test_a_defect_and_a_full_disk_change_nothing_and_are_told(tmp_path: Path, ca
     data = content()
     map_id = read(data).meta.map_id
     (tmp_path / f"map-{map_id:08x}-00000001.lumimap").write_bytes(data)
-    keeper = Quiet()
+    autosaver = Quiet()
 
     async def go(**maps: Any) -> str:
         made = Maps(Store(tmp_path), unjudged, maps.pop("make", lambda start: start), **maps)
-        switch = MapSwitch(made, keeper, lambda _, taken: taken())  # type: ignore[arg-type]  # all that is asked of it
+        switch = MapSwitch(made, autosaver, lambda _, taken: taken())  # type: ignore[arg-type]  # all that is asked of it
         ended: list[str] = []
         switch.ask(map_id, ended.append)
         while not ended:  # noqa: ASYNC110 - a thread ends it
@@ -350,12 +352,12 @@ def test_the_map_switched_to_is_not_taken_for_one_begun_anew(tmp_path: Path) -> 
 
     async def body() -> None:
         clock: Any = _Later()
-        keeper = Keeper(Store(tmp_path, mend=False), None, lambda: state, lambda: used[0], About(), clock)
-        keeper._image = saved.append  # type: ignore[method-assign,assignment]  # what would be saved
-        keeper.switched(2, start)  # type: ignore[arg-type]  # only kept
+        autosaver = MapAutosaver(Store(tmp_path, mend=False), None, lambda: state, lambda: used[0], About(), clock)
+        autosaver._image = saved.append  # type: ignore[method-assign,assignment]  # what would be saved
+        autosaver.switched(2, start)  # type: ignore[arg-type]  # only kept
         used[0] = 2
-        keeper._go_on()
+        autosaver._go_on()
         assert saved == []
-        assert keeper._start is start
+        assert autosaver._start is start
 
     asyncio.run(body())

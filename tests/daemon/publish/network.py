@@ -9,7 +9,7 @@ import struct
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
-from daemon.publish.modbus import server
+from daemon.publish.modbus import tcp_endpoint
 from daemon.publish.modbus.server import ModbusPublisher
 from hal.clock import SystemClock
 from hal.errors import DeviceRefused
@@ -147,8 +147,8 @@ class Wire(asyncio.Transport):
     abort = close
 
 
-def plugged(endpoint: server.TcpEndpoint) -> tuple[server.Connection, Wire]:
-    connection = server.Connection(endpoint)
+def plugged(endpoint: tcp_endpoint.TcpEndpoint) -> tuple[tcp_endpoint.Connection, Wire]:
+    connection = tcp_endpoint.Connection(endpoint)
     wire = Wire(connection)
     connection.connection_made(wire)
     return connection, wire

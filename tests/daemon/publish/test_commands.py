@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from daemon.publish.commands import ASKED, NO_RECORDER, Orders
+from daemon.publish.feeds import Feeds
 from daemon.publish.modbus.holding import CommandCode, Outcome, Request
-from daemon.publish.network import Feeds
+from daemon.system.callbacks import OnDone
 from estimator.measurements import Command, Order
 from tests.daemon.publish.modbus.test_registers import snapshot
-
-Told = Callable[[str], None]
 
 
 class Clock:
@@ -35,14 +33,14 @@ class Bench:
     def __init__(self, **able: Any) -> None:
         self.ended: list[tuple[int, Outcome]] = []
         self.commands: list[Command] = []
-        self.saves: list[Told] = []
+        self.saves: list[OnDone] = []
         feeds = Feeds(lambda _: None, lambda _: None, self.commands.append, self.saves.append, **able)
 
         self.clock = Clock()
         self.orders = Orders(self.clock, feeds, lambda number, outcome: self.ended.append((number, outcome)))
 
     def ask(self, number: int, code: CommandCode, map_id: int = 0) -> None:
-        self.orders.take(Request(number, code, (1.0, 2.0, 0.5), map_id))
+        self.orders.handle(Request(number, code, (1.0, 2.0, 0.5), map_id))
 
 
 @pytest.mark.parametrize("order", [Order.SET_POSE, Order.RESET, Order.RELOCALISE])
@@ -102,8 +100,8 @@ def test_orders_at_any_rate_do_not_fill_the_log(caplog: pytest.LogCaptureFixture
 
 
 def test_what_takes_long_is_done_when_it_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    dumps: list[Told] = []
-    switches: list[tuple[int, Told]] = []
+    dumps: list[OnDone] = []
+    switches: list[tuple[int, OnDone]] = []
     bench = Bench(on_dump=dumps.append, on_switch=lambda map_id, told: switches.append((map_id, told)))
     bench.ask(1, CommandCode.SAVE_MAP)
     bench.ask(2, CommandCode.DUMP_RECORDER)
@@ -126,7 +124,7 @@ def test_what_a_run_cannot_do_is_refused(code: CommandCode) -> None:
 
 
 def test_whatever_goes_wrong_with_an_order_its_client_hears_of_its_end(caplog: pytest.LogCaptureFixture) -> None:
-    def broken(told: Told) -> None:
+    def broken(told: OnDone) -> None:
         raise MemoryError
 
     bench = Bench(on_dump=broken)

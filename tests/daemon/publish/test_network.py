@@ -1,4 +1,4 @@
-"""Orders and odometry that come in over Modbus and UDP, through real sockets to the estimate and back."""
+"""ActiveFaults and odometry that come in over Modbus and UDP, through real sockets to the estimate and back."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from typing import TypeVar
 
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig, OdometryConfig, PoseConfig
 from daemon.health.faults import Fault
 from daemon.health.reasons import Reason
 from daemon.publish import udp_subscriptions
+from daemon.publish.feeds import Feeds
 from daemon.publish.modbus import registers
 from daemon.publish.modbus.holding import COMMAND_ADDRESS, CommandCode, Outcome
-from daemon.publish.network import Feeds, Network
+from daemon.publish.network import Network
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
@@ -29,7 +30,7 @@ from hal.clock import LoopClock, SystemClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01
 from hal.fake.lidar.scan_world import Room
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inet import numeric
 from hal.net.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, encode
 
@@ -91,7 +92,7 @@ class Bench:
         async def warm() -> None:
             """Loaded already."""
 
-        world = World(
+        world = Environment(
             clock,
             opener=opener,
             make_worker=CycleWorker,
@@ -182,7 +183,7 @@ def test_datagrams_of_odometry_and_gyro_reach_the_cycle_and_poses_go_out() -> No
                     sender.send(encode(InputDatagram(ODOMETRY_MAGIC, 1, i, 0, 0.05 * i, (0.0, 0.0, 0.0))))
                     sender.send(encode(InputDatagram(IMU_MAGIC, 1, i, 0, 0.05 * i, (0.0,))))
                     await asyncio.sleep(0.05)
-            taken = bench.daemon.cycle.inbox.take()
+            taken = bench.daemon.cycle.inbox.drain()
             assert (taken.odometry_total, taken.imu_total) == (40, 40)
             assert bench.snapshots[-1].odometry_ok is True
             latest = registers.decode_datagram(receiver.recv(2000))

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.recording.checkpoint import take
+from daemon.recording.checkpoint import capture
 from daemon.recording.restore import restore
 from estimator.measurements import UNLIMITED, LightEpoch, Record, Scan
 from estimator.numerics import se2
 from estimator.pipeline import step
 from estimator.state import State
 from estimator.stored_map import restored
-from tests.daemon.mapmaker import Shape, image
+from tests.daemon.support.map_maker import Shape, image
 from tests.estimator.lit import lit_state, scans, together
 from tools.sim.light.link_drive import room_run
 
@@ -23,14 +23,14 @@ def state(submaps: int, loose: int = 0) -> State:
 
 
 def test_what_is_pickled_at_once_does_not_grow_with_the_submaps() -> None:
-    few, many = (len(take(state(count, loose=count - 1), {})._root) for count in (4, 104))
+    few, many = (len(capture(state(count, loose=count - 1), {})._root) for count in (4, 104))
     assert many - few < 100, "not even a reference to each"
 
 
 def test_submaps_are_those_that_were_there_when_it_was_taken() -> None:
     before = state(5)
     keys, places = list(before.map.graph.submaps), [submap.place() for submap in before.map.graph.submaps.values()]
-    taken = take(before, {"one": before.map.graph.submaps[keys[2]]})
+    taken = capture(before, {"one": before.map.graph.submaps[keys[2]]})
     del before.map.graph.submaps[keys[0]]
     after, rest = restore(taken.pieces())
     assert list(after.map.graph.submaps) == keys
@@ -52,7 +52,7 @@ def test_a_drive_in_which_the_laser_tells_light_the_way_goes_on_from_any_moment(
         if not isinstance(record, Scan | LightEpoch):
             continue
         if count % 37 == 36:
-            then, _ = restore(take(first, {}).pieces())
+            then, _ = restore(capture(first, {}).pieces())
             assert first.light is not None
             guided += first.light.has_motion
         if isinstance(record, Scan) and 6.0 < record.t_end < 6.3:  # somebody stands before it, all at once

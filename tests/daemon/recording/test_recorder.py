@@ -15,18 +15,18 @@ from pathlib import Path
 import pytest
 
 from daemon.config.schema import Config
+from daemon.devices.light_setup import RESIDUALS, Lights
 from daemon.recording import disk_writer
 from daemon.recording.disk_writer import SegmentWriter
 from daemon.recording.recorder import Recorder
 from daemon.recording.retention import RING
-from daemon.runtime.light_setup import RESIDUALS, Lights
 from estimator.cdma.air_interface import PROFILE_A
 from hal.clock import SystemClock
 from hal.errors import DeviceMissing, HalError
 from hal.port.port import Port, memory_pair
 from hal.replay.recording import Frame, Kind, open_recording
 from hal.replay.report import LogReport
-from tests.daemon.mapmaker import SURVEY
+from tests.daemon.support.map_maker import SURVEY
 
 
 @pytest.fixture(autouse=True)

@@ -18,7 +18,7 @@ from daemon.recording import restore as reading
 from daemon.recording.checkpoint import Taken
 from daemon.recording.restore import ROOT, CannotRestore, Piece, function_within, restore
 from daemon.snapshot import State as Said
-from estimator.measurements import Limits, Rung
+from estimator.measurements import DegradationLevel, Limits
 from estimator.numerics import se2
 
 
@@ -111,7 +111,7 @@ FORGED = {
     "something that is no field": Build(new(Limits), {"anything": 1}),
     "fields that are too many": Build(new(Limits), [0] * 40),
     "a member of an enumeration": Build(Fault.LIDAR_SILENT, {"_value_": 0}),
-    "a member of another": Build(Rung.FULL, (None, {"_value_": 3})),
+    "a member of another": Build(DegradationLevel.FULL, (None, {"_value_": 3})),
     "a function of the estimator": Build(se2.compose, (None, {"__defaults__": (1,)})),
     "a function of the reader": Build(reading.blank, (None, {"__defaults__": (1,)})),
     "a function, by the reader's own": Call(reading.fill, se2.compose, {"__defaults__": (1,)}),
@@ -156,7 +156,7 @@ def test_what_is_honest_comes_back() -> None:
     watch.late = 3
     honest: dict[str, Any] = {
         "watch": watch,
-        "limits": Limits(5, 100, update_map=False, rung=Rung.CARRIED),
+        "limits": Limits(5, 100, update_map=False, level=DegradationLevel.CARRIED),
         "fault": Fault.LIDAR_SILENT,
         "arrays": [np.arange(6.0).reshape(2, 3)[:, ::2], np.zeros(0, np.uint8), np.float64(1.5), np.array(["ab"])],
         "partial": functools.partial(se2.compose, 1),

@@ -1,4 +1,4 @@
-"""The keeper of a recording's folder: what it takes away where states cannot be had, and which dumps it keeps."""
+"""The autosaver of a recording's folder: what it takes away where states cannot be had, and which dumps it keeps."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def ring(folder: Path) -> Flight:
     return Flight(folder, 60.0)
 
 
-def grow(keeper: Flight, folder: Path, segments: int) -> None:
+def grow(autosaver: Flight, folder: Path, segments: int) -> None:
     """Segments that are complete, each followed by one for which no state could be taken."""
     for number in range(segments):
         path = folder / segment_name(number)
         path.write_bytes(bytes(SEGMENT))
-        keeper.closed(number, path)
-        keeper.begun(Begun(number + 1, 10.0 * number, None, b"", {}))
+        autosaver.closed(number, path)
+        autosaver.begun(Begun(number + 1, 10.0 * number, None, b"", {}))
 
 
 def ended(folder: Path) -> bool:
@@ -46,9 +46,9 @@ def ended(folder: Path) -> bool:
 
 def test_a_ring_without_states_does_not_fill_the_disk(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    keeper = ring(folder)
-    grow(keeper, folder, 50)
-    keeper.close(ended=True)
+    autosaver = ring(folder)
+    grow(autosaver, folder, 50)
+    autosaver.close(ended=True)
     left = sorted(folder.glob("*.lumirec"))
     assert len(left) == 10
     assert left[-1].name == segment_name(49)
@@ -56,25 +56,25 @@ def test_a_ring_without_states_does_not_fill_the_disk(tmp_path: Path) -> None:
 
 def test_a_ring_without_states_keeps_its_beginning_as_long_as_there_is_room(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    keeper = ring(folder)
-    grow(keeper, folder, 10)
-    keeper.close(ended=True)
+    autosaver = ring(folder)
+    grow(autosaver, folder, 10)
+    autosaver.close(ended=True)
     assert len(list(folder.glob("*.lumirec"))) == 10
 
 
 def test_maps_that_were_switched_to_go_with_the_segments_that_took_them(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    keeper = ring(folder)
+    autosaver = ring(folder)
     old, new = folder / "switch-0123456789abcdef.lumimap", folder / "switch-fedcba9876543210.lumimap"
     for path, age_s in ((old, 3600.0), (new, 0.0)):
         path.write_bytes(b"map")
         os.utime(path, (time.time() - age_s, time.time() - age_s))
-    grow(keeper, folder, 9)
-    keeper.close(ended=True)
+    grow(autosaver, folder, 9)
+    autosaver.close(ended=True)
     assert old.exists(), "nothing was taken away yet"
-    keeper = Flight(folder, 60.0)
-    grow(keeper, folder, 20)
-    keeper.close(ended=True)
+    autosaver = Flight(folder, 60.0)
+    grow(autosaver, folder, 20)
+    autosaver.close(ended=True)
     assert not old.exists()
     assert new.exists()
 
@@ -83,11 +83,11 @@ def test_the_dump_just_made_stays_whatever_the_clock_says(tmp_path: Path) -> Non
     folder = tmp_path / "run"
     for day in range(DUMPS):
         (tmp_path / f"{DUMP}2026-11-{day + 1:02d}T00-00-00Z-fault-101").mkdir()
-    keeper = ring(folder)
-    grow(keeper, folder, 1)
+    autosaver = ring(folder)
+    grow(autosaver, folder, 1)
     told: list[str] = []
-    keeper.dump({"at": "1970-01-01T00-00-09Z", "reason": "fault-101", "why": "a test", "t_mono": 9.0}, told.append)
-    keeper.close(ended=True)
+    autosaver.dump({"at": "1970-01-01T00-00-09Z", "reason": "fault-101", "why": "a test", "t_mono": 9.0}, told.append)
+    autosaver.close(ended=True)
     assert told == [""]
     kept = sorted(path.name for path in tmp_path.glob(f"{DUMP}*"))
     assert len(kept) == DUMPS
@@ -99,13 +99,13 @@ def test_dumps_that_were_asked_for_do_not_push_out_those_of_faults(tmp_path: Pat
     folder = tmp_path / "run"
     for day in range(DUMPS + 3):
         (tmp_path / f"{DUMP}2026-10-{day + 1:02d}T00-00-00Z-fault-101").mkdir()
-    keeper = ring(folder)
-    grow(keeper, folder, 1)
+    autosaver = ring(folder)
+    grow(autosaver, folder, 1)
     told: list[str] = []
     for _ in range(3 * ASKED_DUMPS):
-        keeper.dump({"at": "2026-11-09T00-00-09Z", "reason": ASKED, "why": "a test", "t_mono": 9.0}, told.append)
-    keeper.dump({"at": "2026-11-09T00-00-10Z", "reason": "fault-104", "why": "a test", "t_mono": 9.0}, told.append)
-    keeper.close(ended=True)
+        autosaver.dump({"at": "2026-11-09T00-00-09Z", "reason": ASKED, "why": "a test", "t_mono": 9.0}, told.append)
+    autosaver.dump({"at": "2026-11-09T00-00-10Z", "reason": "fault-104", "why": "a test", "t_mono": 9.0}, told.append)
+    autosaver.close(ended=True)
     assert told == [""] * (3 * ASKED_DUMPS + 1)
     kept = [path.name for path in tmp_path.glob(f"{DUMP}*")]
     assert sum(f"-{ASKED}" in name for name in kept) == ASKED_DUMPS
@@ -121,14 +121,14 @@ def test_whoever_asks_for_a_dump_is_told_whatever_happens(
         raise error
 
     monkeypatch.setattr(retention, "_linked", fails)
-    keeper = ring(tmp_path / "run")
+    autosaver = ring(tmp_path / "run")
     told: list[str] = []
     for _ in range(2):
-        keeper.dump({"at": "x", "reason": ASKED, "why": "a test", "t_mono": 9.0}, told.append)
-    keeper.close(ended=True)
+        autosaver.dump({"at": "x", "reason": ASKED, "why": "a test", "t_mono": 9.0}, told.append)
+    autosaver.close(ended=True)
     assert len(told) == 2
     assert all(told)
-    assert keeper.error
+    assert autosaver.error
     assert not ended(tmp_path / "run"), "the ring is all there is of the dump, and the next start is to keep it"
 
 
@@ -168,26 +168,26 @@ def test_a_ring_of_which_something_is_still_being_written_has_not_ended(
     """As a large state is, before the dump that waits for it; the next start keeps the ring."""
     monkeypatch.setattr(retention, "CLOSE_S", 0.05)
     folder, goes_on = tmp_path / "run", threading.Event()
-    keeper = ring(folder)
-    keeper.dump(ABOUT, lambda _: None if goes_on.wait(30.0) else pytest.fail("never"))
-    keeper.close(ended=True)
+    autosaver = ring(folder)
+    autosaver.dump(ABOUT, lambda _: None if goes_on.wait(30.0) else pytest.fail("never"))
+    autosaver.close(ended=True)
     assert not ended(folder)
     goes_on.set()
-    keeper._thread.join(30.0)
-    keeper.close(ended=True)
+    autosaver._thread.join(30.0)
+    autosaver.close(ended=True)
     assert ended(folder)
 
 
 def test_a_dump_has_the_segment_that_is_being_written_though_there_is_no_state(tmp_path: Path) -> None:
-    """At the start, before the estimator is loaded; whether the keeper has heard of the segment yet or not."""
+    """At the start, before the estimator is loaded; whether the autosaver has heard of the segment yet or not."""
     folder = tmp_path / "run"
-    keeper = ring(folder)
-    grow(keeper, folder, 1)
+    autosaver = ring(folder)
+    grow(autosaver, folder, 1)
     for number in (1, 2):
         (folder / segment_name(number)).write_bytes(b"as far as it is")
     (folder / ".000002.lumistate.part").touch()
-    keeper.dump(ABOUT, lambda _: None)
-    keeper.close(ended=True)
+    autosaver.dump(ABOUT, lambda _: None)
+    autosaver.close(ended=True)
     (dump,) = tmp_path.glob(f"{DUMP}*")
     assert [path.name for path in sorted(dump.glob("*.lumirec"))] == list(map(segment_name, range(3)))
     assert (dump / segment_name(2)).samefile(folder / segment_name(2)), "it goes on growing"
@@ -234,13 +234,13 @@ def kept(folder: Path) -> list[str]:
     return sorted(path.name.removeprefix(f"{DUMP}2026-11-") for path in folder.glob(f"{DUMP}*"))
 
 
-def turn(keeper: Flight, folder: Path, number: int) -> None:
+def turn(autosaver: Flight, folder: Path, number: int) -> None:
     """A segment is complete, and another one is begun, with a state."""
     path = folder / segment_name(number)
     path.write_bytes(b"x" * LARGE)
-    keeper.closed(number, path)
-    keeper._tasks.put(lambda: keeper._segments.update({number + 1: retention._Segment(0, 10.0 * number, True)}))
-    keeper.begun(Begun(number + 1, 10.0 * number, None, b"", {}))
+    autosaver.closed(number, path)
+    autosaver._tasks.put(lambda: autosaver._segments.update({number + 1: retention._Segment(0, 10.0 * number, True)}))
+    autosaver.begun(Begun(number + 1, 10.0 * number, None, b"", {}))
 
 
 @pytest.mark.parametrize(
@@ -259,12 +259,12 @@ def test_where_there_is_no_room_dumps_go_before_what_is_recorded(
 ) -> None:
     """The oldest first, those that were asked for after the others, and the newest not at all."""
     folder = tmp_path / "run"
-    keeper = ring(folder)
-    turn(keeper, folder, 0)
-    turn(keeper, folder, 1)
-    keeper._tasks.put(lambda: small_disk.lacks(large))
-    keeper.begun(Begun(2, 20.0, None, b"", {}))
-    keeper.close(ended=True)
+    autosaver = ring(folder)
+    turn(autosaver, folder, 0)
+    turn(autosaver, folder, 1)
+    autosaver._tasks.put(lambda: small_disk.lacks(large))
+    autosaver.begun(Begun(2, 20.0, None, b"", {}))
+    autosaver.close(ended=True)
     assert kept(tmp_path) == sorted(DAYS.keys() - gone)
     assert len(list(folder.glob("*.lumirec"))) == segments
 
@@ -273,15 +273,15 @@ def test_room_that_two_dumps_hold_is_had_when_both_have_gone_and_the_one_just_ma
     tmp_path: Path, small_disk: Disk
 ) -> None:
     folder = tmp_path / "run"
-    keeper = ring(folder)
-    turn(keeper, folder, 0)
-    turn(keeper, folder, 1)
+    autosaver = ring(folder)
+    turn(autosaver, folder, 0)
+    turn(autosaver, folder, 1)
     for second in (1, 2):
-        keeper.dump({**ABOUT, "at": f"1970-01-01T00-00-0{second}Z"}, lambda _: None)
-    keeper._tasks.put(lambda: [os.utime(dump, (1.0, 1.0)) for dump in tmp_path.glob(f"{DUMP}1970*")])
-    keeper._tasks.put(lambda: small_disk.lacks(0.5))
-    keeper.begun(Begun(2, 20.0, None, b"", {}))
-    keeper.close(ended=True)
+        autosaver.dump({**ABOUT, "at": f"1970-01-01T00-00-0{second}Z"}, lambda _: None)
+    autosaver._tasks.put(lambda: [os.utime(dump, (1.0, 1.0)) for dump in tmp_path.glob(f"{DUMP}1970*")])
+    autosaver._tasks.put(lambda: small_disk.lacks(0.5))
+    autosaver.begun(Begun(2, 20.0, None, b"", {}))
+    autosaver.close(ended=True)
     assert not (tmp_path / f"{DUMP}1970-01-01T00-00-01Z-fault-104").exists()
     assert (tmp_path / f"{DUMP}1970-01-01T00-00-02Z-fault-104").exists()
     assert len(list(folder.glob("*.lumirec"))) == 2
@@ -295,12 +295,12 @@ def test_where_a_dump_cannot_be_taken_away_what_is_recorded_is(
 
     monkeypatch.setattr(retention.shutil, "rmtree", refused)
     folder = tmp_path / "run"
-    keeper = ring(folder)
-    turn(keeper, folder, 0)
-    turn(keeper, folder, 1)
-    keeper._tasks.put(lambda: small_disk.lacks(0.5))
-    keeper.begun(Begun(2, 20.0, None, b"", {}))
-    keeper.close(ended=True)
+    autosaver = ring(folder)
+    turn(autosaver, folder, 0)
+    turn(autosaver, folder, 1)
+    autosaver._tasks.put(lambda: small_disk.lacks(0.5))
+    autosaver.begun(Begun(2, 20.0, None, b"", {}))
+    autosaver.close(ended=True)
     assert kept(tmp_path) == sorted(DAYS)
     assert len(list(folder.glob("*.lumirec"))) == 1
-    assert not keeper.error
+    assert not autosaver.error

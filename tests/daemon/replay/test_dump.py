@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from daemon.cli import parser
-from daemon.cli.replay import replay
 from daemon.config.schema import Config
 from daemon.health.faults import Fault
 from daemon.recording import checkpoint, disk_writer, flight_recorder
@@ -19,6 +18,8 @@ from daemon.recording.disk_writer import CLOCK, SegmentWriter
 from daemon.recording.replay_start import CYCLE_PARTS
 from daemon.recording.retention import ABOUT, DUMP, Flight
 from daemon.recording.state_file import read_header
+from daemon.replay.log_replay import replay
+from daemon.system import console
 from hal.clock import run_virtual
 from hal.errors import DataInvalid
 from hal.replay.recording import Kind, frames_in, open_recording
@@ -43,7 +44,7 @@ def let_write(seconds: float) -> None:
 
 
 def replayed(folder: Path, out: Path) -> dict[str, dict[str, Any]]:
-    assert parser.main(["replay", str(folder), "--out", str(out)]) == parser.OK
+    assert parser.main(["replay", str(folder), "--out", str(out)]) == console.OK
     summary: dict[str, dict[str, Any]] = json.loads((out / "summary.json").read_text())
     return summary
 
@@ -215,7 +216,7 @@ def test_everything_that_a_cycle_remembers_is_kept_or_left_out_on_purpose() -> N
         bench.recorder.close()
         return set(vars(bench.daemon.cycle))
 
-    left_out = {"parts", "cycle_us", "failing", "laps", "taker", "_switch", "_switched", "_held"}  # their jobs are kept
+    left_out = {"parts", "cycle_us", "failing", "stage_timer", "timing", "_switched", "_held"}  # their jobs are kept
     assert run_virtual(cycle()) == {*CYCLE_PARTS, *left_out}
 
 
@@ -240,7 +241,7 @@ def test_a_ring_whose_run_was_killed_is_kept_as_a_dump_and_one_that_ended_goes(t
 def test_a_defect_of_the_flight_recorder_is_a_fault_and_the_cycle_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(checkpoint, "take", broken)
+    monkeypatch.setattr(checkpoint, "capture", broken)
     bench = record(tmp_path / "rec", long)
     assert bench.snapshots[-1].pose is not None
     assert bench.recorder.failing == {"flight recorder"}

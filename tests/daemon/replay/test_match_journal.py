@@ -13,6 +13,7 @@ import pytest
 from daemon.cli import parser
 from daemon.replay import match_journal, match_plot
 from daemon.replay.match_journal import MOST, MOST_FAILED, BadChoice, Choice, MatchJournal, choice_of
+from daemon.system import console
 from estimator.result import Reason
 from estimator.scan_matching import scan_matcher
 from tests.daemon.cli.test_replay import RESULTS
@@ -35,7 +36,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def out(log: Path) -> Path:
     folder = log.parent / "out"
     arguments = ["--journal", "1,12", "--journal-at", "3.05"]
-    assert parser.main(["replay", str(log), "--out", str(folder), *arguments]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(folder), *arguments]) == console.OK
     return folder
 
 
@@ -96,7 +97,7 @@ def test_where_stamps_step_back_the_line_is_that_of_the_stamp(tmp_path: Path) ->
     stamps = run.stamps.copy()
     stamps[[9, 10]] = stamps[[10, 9]]
     log = carmen(tmp_path / "room.log", Drive(run.truth, run.odometry, run.ranges, stamps))
-    assert parser.main(["replay", str(log), "--out", str(tmp_path / "out"), "--journal", "9,10,11"]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path / "out"), "--journal", "9,10,11"]) == console.OK
     assert [same_pose(tmp_path / "out", number)["pose"] for number in (9, 10, 11)] == [9, 11, 10]
 
 
@@ -113,7 +114,7 @@ def test_poses_that_light_alone_has_held_have_no_match(tmp_path: Path) -> None:
     record(tmp_path / "rec", lidar_away, lidar=True)
     folder = tmp_path / "out"
     words = ",".join(str(number) for number in range(1, 100, 14))
-    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(folder), "--journal", words]) == parser.OK
+    assert parser.main(["replay", str(tmp_path / "rec"), "--out", str(folder), "--journal", words]) == console.OK
     numbers = sorted(int(file.stem.split("-")[1]) for file in folder.glob("match-*.json"))
     poses = [same_pose(folder, number)["pose"] for number in numbers]
     assert poses[-1] > numbers[-1], "poses without a match lie between"
@@ -142,20 +143,20 @@ def test_pictures_are_pictures(out: Path) -> None:
 
 
 def test_a_journal_changes_no_result_and_is_the_same_twice(log: Path, out: Path, tmp_path: Path) -> None:
-    assert parser.main(["replay", str(log), "--out", str(tmp_path / "plain")]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path / "plain")]) == console.OK
     for name in RESULTS - {"timing.json", "summary.json"}:
         assert (tmp_path / "plain" / name).read_bytes() == (out / name).read_bytes(), name
     plain, journalled = (json.loads((folder / "summary.json").read_text()) for folder in (tmp_path / "plain", out))
     assert plain.pop("matches") is None
     assert [match["match"] for match in journalled.pop("matches")] == [1, 12, 32]
     assert plain == journalled
-    assert parser.main(["replay", str(log), "--out", str(tmp_path / "again"), "--journal", "12"]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path / "again"), "--journal", "12"]) == console.OK
     for kind in ("json", "png"):
         assert (tmp_path / "again" / f"match-12.{kind}").read_bytes() == (out / f"match-12.{kind}").read_bytes()
 
 
 def test_what_failed_is_written_with_its_reason(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert parser.main(["replay", str(log), "--out", str(tmp_path), "--journal", "failed"]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path), "--journal", "failed"]) == console.OK
     assert "5 matches were no result" in capsys.readouterr().err
     numbers = sorted(int(file.stem.split("-")[1]) for file in tmp_path.glob("match-*.json"))
     assert numbers == [21, 22, 23, 24, 25]
@@ -177,14 +178,14 @@ def test_numbers_and_times_that_the_log_has_not_are_said(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["--journal", "2,900", "--journal-at", "77"]
-    assert parser.main(["replay", str(log), "--out", str(tmp_path), *arguments]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path), *arguments]) == console.OK
     said = capsys.readouterr().err
     assert f"no match 900: the log has {SCANS}" in said
     assert "no match at or after 77 s" in said
     assert (tmp_path / "match-2.json").exists()
     assert "matches written: 1\n" in said
     (tmp_path / "match-notes.json").write_text("a person's own")
-    assert parser.main(["replay", str(log), "--out", str(tmp_path), "--journal", "99999"]) == parser.FAILED
+    assert parser.main(["replay", str(log), "--out", str(tmp_path), "--journal", "99999"]) == console.FAILED
     said = capsys.readouterr().err
     assert "matches written: 0; files of an earlier run removed: 2" in said
     assert "none of the matches asked for is in the log" in said
@@ -196,7 +197,7 @@ def test_a_rejected_match_says_what_it_showed_and_what_was_asked(tmp_path: Path)
     ranges = run.ranges.copy()
     ranges[30] = np.random.default_rng(5).uniform(0.5, 7.0, ranges.shape[1])  # walls of no room
     log = carmen(tmp_path / "room.log", Drive(run.truth, run.odometry, ranges, run.stamps))
-    assert parser.main(["replay", str(log), "--out", str(tmp_path / "out"), "--journal", "30,31"]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path / "out"), "--journal", "30,31"]) == console.OK
     assert written(tmp_path / "out", 30)["refusal"] is None
     match = written(tmp_path / "out", 31)
     assert match["result"]["reason"] == "REJECTED"
@@ -212,7 +213,7 @@ def test_a_wrong_choice_is_wrong_usage(
     words: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["replay", str(log), "--out", str(tmp_path / "none"), f"--journal={words}"]
-    assert parser.main(arguments) == parser.USAGE
+    assert parser.main(arguments) == console.USAGE
     assert "--journal" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
 
@@ -227,7 +228,7 @@ def test_without_matplotlib_the_data_is_written_and_the_pictures_are_missed(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(match_plot, "find_spec", lambda name: None)
-    assert parser.main(["replay", str(log), "--out", str(tmp_path), "--journal", "3"]) == parser.OK
+    assert parser.main(["replay", str(log), "--out", str(tmp_path), "--journal", "3"]) == console.OK
     assert "no pictures of matches: matplotlib is not installed" in capsys.readouterr().err
     assert {file.name for file in tmp_path.glob("match*")} == {"match-3.json"}
 
@@ -235,7 +236,7 @@ def test_without_matplotlib_the_data_is_written_and_the_pictures_are_missed(
 def test_a_recording_with_lights_tells_what_light_said(tmp_path: Path) -> None:
     bench = record(tmp_path / "rec", calm, lidar=True)
     arguments = ["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out"), "--journal", "2"]
-    assert parser.main(arguments) == parser.OK
+    assert parser.main(arguments) == console.OK
     assert bench.daemon.cycle.cycles > 10
     match = written(tmp_path / "out", 2)
     assert match["light"]["fix"] in {"NONE", "STARTING", "GOOD", "HELD", "AMBIGUOUS"}

@@ -16,11 +16,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from daemon.app import Daemon, World
-from daemon.cli.replay import Given, replay
+from daemon.app import Daemon, Environment
 from daemon.config.schema import Config, LidarConfig, Mask, ModbusConfig, Mount
+from daemon.replay.log_replay import replay
+from daemon.replay.recorded_inputs import Given
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import CycleRecord
+from daemon.runtime.cycle_parts import CycleRecord
 from daemon.runtime.worker import CycleWorker
 from estimator.numerics import se2
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual
@@ -28,8 +29,8 @@ from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01, UTM_30LX, LidarModel, Unit
 from hal.fake.lidar.rotor import TimetableRotor
 from hal.fake.lidar.scan import FakeScan
-from hal.fake.pty_server import PtyServer
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
+from hal.fake.transport.pty_server import PtyServer
 from hal.lidar import VALID, RawScan
 from hal.odometry import RawOdometry
 from hal.port.opening import open_port
@@ -121,7 +122,7 @@ def make_daemon(lidar: LidarConfig, device: str, clock: Clock, opener: PortOpene
         load()
 
     settings = Config(lidar=msgspec.structs.replace(lidar, device=device), modbus=ModbusConfig(port=0))
-    world = World(
+    world = Environment(
         clock, opener=opener, make_worker=CycleWorker, make_budget=FixedBudget, stopwatch=None, warm_up=warm,
         draw_map_id=lambda: 1,
     )  # fmt: skip

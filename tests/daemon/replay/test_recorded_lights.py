@@ -16,27 +16,28 @@ from msgspec.structs import replace
 
 from daemon.app import Daemon
 from daemon.cli import parser
-from daemon.cli.replay import Given, lights_for
 from daemon.commissioning.teach_drive import read_drive
 from daemon.config.loader import dump
 from daemon.config.residual_file import write_residuals
 from daemon.config.schema import Config, Mount
 from daemon.config.survey_loader import write_survey
+from daemon.devices.light_setup import RESIDUALS, Lights, from_header
 from daemon.recording.recorder import Recorder, decode_cycle
+from daemon.replay.recorded_inputs import Given, lights_for
 from daemon.replay.sources import open_log
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.light_setup import RESIDUALS, Lights, from_header
+from daemon.system import console
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.measurements import Limits
 from hal.clock import run_virtual
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
 from hal.replay.report import LogReport
-from tests.daemon.driven import during
-from tests.daemon.lightroom import BUS, SURVEY
 from tests.daemon.replay.test_recorded_run import assert_the_same
 from tests.daemon.scenarios.test_lights import LIDAR, Bench, decoded, settings
 from tests.daemon.scenarios.test_residual_maps import even_map
+from tests.daemon.support.light_room import BUS, SURVEY
+from tests.daemon.support.whole_daemon import during
 
 
 class UnevenBudget(FixedBudget):
@@ -86,7 +87,7 @@ def record(
 
 
 def replay(folder: Path, out: Path, *options: str) -> dict[str, dict[str, object]]:
-    assert parser.main(["replay", str(folder), "--out", str(out), *options]) == parser.OK
+    assert parser.main(["replay", str(folder), "--out", str(out), *options]) == console.OK
     summary: dict[str, dict[str, object]] = json.loads((out / "summary.json").read_text())
     return summary
 
@@ -150,7 +151,7 @@ def test_another_survey_may_be_asked_for(tmp_path: Path, capsys: pytest.CaptureF
     record(tmp_path / "rec", calm, lidar=True)
     missing = tmp_path / "nowhere.toml"
     arguments = ["replay", str(tmp_path / "rec"), "--out", str(tmp_path / "out"), "--set", f"lights.survey={missing}"]
-    assert parser.main(arguments) == parser.FAILED
+    assert parser.main(arguments) == console.FAILED
     assert "no such survey" in capsys.readouterr().err
     without = replay(tmp_path / "rec", tmp_path / "out", "--set", "photodiode.bus=")
     assert without["counts"]["poses"]

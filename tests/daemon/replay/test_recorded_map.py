@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from daemon.cli import parser
-from daemon.cli.replay import Given, start_for
 from daemon.config.schema import Config, MapConfig
 from daemon.maps.image import meta_of, packed
-from daemon.maps.store import START, Start, Store, started
+from daemon.maps.initial_state import started
+from daemon.maps.store import START, Start, Store
+from daemon.replay.recorded_inputs import Given, start_for
 from daemon.replay.sources import open_log
 from daemon.snapshot import State
+from daemon.system import console
 from estimator.mapping.map_snapshot import Identity
 from estimator.numerics import se2
 from estimator.stored_map import image_of
@@ -69,7 +71,7 @@ def test_a_replay_without_the_map_is_refused(
         (recording / START).unlink()
         if content is not None:
             (recording / START).write_bytes(content)
-        assert parser.main(["replay", str(run[0] / "second"), "--out", str(tmp_path / "out")]) == parser.FAILED
+        assert parser.main(["replay", str(run[0] / "second"), "--out", str(tmp_path / "out")]) == console.FAILED
         said = capsys.readouterr().err
         assert why in said
         assert "--set map.folder=DIR" in said
@@ -81,7 +83,7 @@ def test_a_replay_may_begin_with_a_map_that_a_person_names(
 ) -> None:
     words = ["replay", str(run[0] / "first"), "--out", str(tmp_path / "out"), "--set", f"map.folder={run[0] / 'maps'}"]
     with caplog.at_level(logging.INFO):
-        assert parser.main(words) == parser.OK
+        assert parser.main(words) == console.OK
     assert "map 00000abc of" in caplog.text
     assert len(list((run[0] / "maps").glob("*.lumimap"))) == 1, "a replay writes no map there"
 
@@ -92,11 +94,11 @@ def test_a_named_folder_without_a_map_is_refused_one_of_a_configuration_is_noted
     empty = tmp_path / "empty"
     empty.mkdir()
     words = ["replay", str(run[0] / "first"), "--out", str(tmp_path / "out")]
-    assert parser.main([*words, "--set", f"map.folder={empty}"]) == parser.FAILED
+    assert parser.main([*words, "--set", f"map.folder={empty}"]) == console.FAILED
     said = capsys.readouterr().err
     assert f"{empty} holds no map that can be used (name another folder" in said
     assert "--set map.folder=none" in said
-    assert parser.main([*words, "--set", "map.folder=none"]) == parser.OK
+    assert parser.main([*words, "--set", "map.folder=none"]) == console.OK
     assert "holds no map" not in capsys.readouterr().err
 
     source = open_log(run[0] / "first")
@@ -108,7 +110,7 @@ def test_the_map_that_a_replay_writes_is_one_to_begin_with(
     run: tuple[Path, Bench, Start], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     replay(run[0] / "first", tmp_path / "out")
-    assert parser.main(["map", "verify", str(tmp_path / "out" / "map.lumimap")]) == parser.OK
+    assert parser.main(["map", "verify", str(tmp_path / "out" / "map.lumimap")]) == console.OK
     assert "good, map" in capsys.readouterr().out
     assert started(MapConfig(folder=str(tmp_path / "out")), None)[1] is not None
 

@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from daemon.cli import parser
-from daemon.cli.why import spans
+from daemon.diagnosis.recorded_spans import spans
 from daemon.snapshot import State
-from tests.daemon.scenarios.test_process import ROOT, fake_lidar, running
+from daemon.system import console
+from tests.daemon.processes.test_process import ROOT, fake_lidar, running
 from tests.taps.documented import documented
 
 
@@ -29,7 +30,7 @@ def test_a_killed_run_is_repeated_to_the_last_bit(tmp_path: Path) -> None:
         time.sleep(3.0)
         daemon.process.kill()
         daemon.process.wait(10.0)
-    assert parser.main(["replay", str(folder), "--out", str(tmp_path / "out")]) == parser.OK
+    assert parser.main(["replay", str(folder), "--out", str(tmp_path / "out")]) == console.OK
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     compared = summary["recorded_run"]
     assert compared["differ"] == 0, compared["first_difference"]
@@ -58,7 +59,7 @@ def test_the_ring_of_a_killed_run_is_a_dump_after_the_next_start_and_is_repeated
     for segment in dump.glob("*.lumirec"):
         if segment.stem < state.stem:
             segment.unlink()
-    assert parser.main(["replay", str(dump), "--out", str(tmp_path / "out")]) == parser.OK
+    assert parser.main(["replay", str(dump), "--out", str(tmp_path / "out")]) == console.OK
     compared = json.loads((tmp_path / "out" / "summary.json").read_text())["recorded_run"]
     assert compared["differ"] == 0, compared["first_difference"]
     assert compared["cycles"] > 20
@@ -92,5 +93,5 @@ def test_a_folder_that_cannot_be_written_costs_the_recording_and_no_more(tmp_pat
         daemon.until(30.0, "state", State.TRACKING)
         daemon.until(10.0, "fault", 402)
         code, said, _ = daemon.stop()
-    assert code == parser.OK
+    assert code == console.OK
     assert "has stopped: Not a directory" in said

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.cli import parser
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount
 from daemon.health.faults import Fault
@@ -25,20 +25,21 @@ from daemon.recording.recorder import CycleEntry, Recorder, decode_cycle
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
+from daemon.system import console
 from estimator.measurements import Command, Limits, Order
 from estimator.numerics import se2
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX, URG_04LX_UG01, LidarModel
 from hal.fake.lidar.scan_world import Room
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind, open_recording, pack_frame, pack_head
 from hal.replay.report import LogReport
-from tests.daemon.driven import during
 from tests.daemon.replay.room import read_tum
+from tests.daemon.support.whole_daemon import during
 
 USB, SERIAL = "/dev/ttyACM0", "/dev/ttyUSB0"
 SETTINGS = Config(lidar=LidarConfig(device=USB, mount=Mount(0.1, -0.02, 30.0)), modbus=ModbusConfig(port=0))
@@ -85,13 +86,13 @@ class Bench:
         self.put_odometry = self.recorder.on_odometry(inbox.put_odometry)
         self.put_imu = self.recorder.on_imu(inbox.put_imu)
 
-    def _world(self) -> World:
+    def _world(self) -> Environment:
         async def warm() -> None:
             from daemon.runtime.warmup import load
 
             load()
 
-        return World(
+        return Environment(
             self.clock,
             opener=self.opener,
             make_worker=CycleWorker,
@@ -134,7 +135,7 @@ def record(
 
 
 def replay(folder: Path, out: Path, *options: str) -> dict[str, dict[str, object]]:
-    assert parser.main(["replay", str(folder), "--out", str(out), *options]) == parser.OK
+    assert parser.main(["replay", str(folder), "--out", str(out), *options]) == console.OK
     summary: dict[str, dict[str, object]] = json.loads((out / "summary.json").read_text())
     return summary
 
@@ -327,7 +328,7 @@ def test_a_recording_with_a_hole_says_where_it_is_not_the_same_run_any_more(
 def test_a_person_may_replay_with_another_configuration(tmp_path: Path) -> None:
     record(tmp_path / "rec", calm)
     arguments = ["--out", str(tmp_path / "out"), "--set", "lidar.mount.yaw=29"]
-    assert parser.main(["replay", str(tmp_path / "rec"), *arguments]) == parser.OK
+    assert parser.main(["replay", str(tmp_path / "rec"), *arguments]) == console.OK
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["config"]["lidar"]["mount"] == {"x": 0.1, "y": -0.02, "yaw": 29.0, "inverted": False}
     assert summary["config"]["lidar"]["device"] == USB  # what nobody asked for is as recorded

@@ -11,18 +11,18 @@ from msgspec.structs import replace
 
 from daemon.app import Daemon
 from daemon.config.schema import MapConfig
-from daemon.maps.store import started
+from daemon.devices.light_setup import Lights
+from daemon.maps.initial_state import started
 from daemon.recording import disk_writer, flight_recorder, retention
 from daemon.recording.recorder import Recorder
-from daemon.runtime.light_setup import Lights
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.measurements import Command, Order
 from hal.clock import run_virtual
-from tests.daemon.driven import during
-from tests.daemon.lightroom import SURVEY
 from tests.daemon.replay.test_dump import let_write, replayed
 from tests.daemon.replay.test_recorded_lights import Recorded
 from tests.daemon.scenarios.test_lights import decoded, settings
+from tests.daemon.support.light_room import SURVEY
+from tests.daemon.support.whole_daemon import during
 
 KEEP_S = 5.0
 Ask = Callable[[Callable[[str], None]], None]
@@ -52,7 +52,7 @@ async def on_to_another_map_and_back(bench: Stored) -> None:
     await bench.until(decoded, 6.0)
     await bench.drive(4.0)
     first = cycle.map_id
-    assert await bench.ended(bench.daemon.keeper.ask) == ""
+    assert await bench.ended(bench.daemon.autosaver.ask) == ""
     cycle.inbox.put_command(Command(bench.loop.time(), Order.RESET))
     await bench.drive(4.0)
     assert cycle.map_id != first

@@ -12,10 +12,11 @@ import pytest
 import yaml
 from PIL import Image
 
+from daemon.maps.grid_files import greys, map_files, map_yaml, pgm
 from daemon.maps.map_drawing import WALL, draw, lettered
 from daemon.maps.map_server import FREE, OCCUPIED
 from daemon.maps.png import encode_png
-from daemon.replay.results import Folder, OutputRefused, Trajectory, greys, guessed, map_files, map_yaml, pgm, tum
+from daemon.replay.results import Folder, OutputRefused, Trajectory, guessed, tum
 from daemon.snapshot import State
 from estimator.mapping.occupancy_grid import Grid
 

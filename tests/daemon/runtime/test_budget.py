@@ -23,7 +23,7 @@ from daemon.runtime.budget import (
     Spent,
     passes,
 )
-from estimator.measurements import UNLIMITED, Limits, Rung
+from estimator.measurements import UNLIMITED, DegradationLevel, Limits
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scan_matching.scan_matcher import MatchSettings
 
@@ -80,7 +80,7 @@ def test_a_quick_machine_is_not_capped() -> None:
 
 def test_first_the_scan_is_thinned_and_map_work_goes_on() -> None:
     limits = learned(1.0, map_us=3000.0).limits(BUDGET_US)
-    assert (limits.rung, limits.update_map) == (Rung.THINNED, True)
+    assert (limits.level, limits.update_map) == (DegradationLevel.THINNED, True)
     assert limits.points == pytest.approx((9500 - FIXED) / ENOUGH_ITERATIONS, abs=2)
     assert limits.icp_iterations == ENOUGH_ITERATIONS
 
@@ -95,38 +95,48 @@ def test_what_is_not_the_iterations_doing_is_no_reason_to_cut_them() -> None:
         limits = budget.limits(100_000.0, carrier=True)
         judge_us = 200_000.0 if k % 3 == 2 else 10.0  # another program
         budget.learn(Spent({"match": 25_000.0, "judge": judge_us}, 100_000.0), limits, step(1, queries=181))
-    assert budget.limits(100_000.0, carrier=True).rung is Rung.FULL, "there is nothing to be had by matching less"
+    assert budget.limits(100_000.0, carrier=True).level is DegradationLevel.FULL, (
+        "there is nothing to be had by matching less"
+    )
 
 
 @pytest.mark.parametrize(
-    ("share", "rung"), [(1.3, Rung.FULL), (1.0, Rung.THINNED), (0.8, Rung.NO_MAP), (0.3, Rung.CARRIED)]
+    ("share", "level"),
+    [
+        (1.3, DegradationLevel.FULL),
+        (1.0, DegradationLevel.THINNED),
+        (0.8, DegradationLevel.NO_MAP),
+        (0.3, DegradationLevel.CARRIED),
+    ],
 )
-def test_a_match_that_nearly_fits_is_made(share: float, rung: Rung) -> None:
+def test_a_match_that_nearly_fits_is_made(share: float, level: DegradationLevel) -> None:
     """``share``: what there is, of what a match takes. More than half of the period is no lost scan yet."""
     budget = learned(1.0)
     limits = [budget.limits(share * match_us(1.0), carrier=True) for _ in range(PROBES + 1)][-1]
-    assert limits.rung is rung
+    assert limits.level is level
     assert limits.icp_iterations >= ENOUGH_ITERATIONS, "the pose converges"
 
 
 def test_then_map_work_waits() -> None:
     limits = learned(0.8, map_us=9000.0).limits(BUDGET_US)
-    assert (limits.rung, limits.update_map) == (Rung.NO_MAP, False)
+    assert (limits.level, limits.update_map) == (DegradationLevel.NO_MAP, False)
     assert (limits.icp_iterations, limits.points) == (32, UNLIMITED.points), "all that is left is for matching"
 
 
 def test_last_the_laser_is_left_out_where_something_else_carries_the_pose() -> None:
     limits = learned(1e6, map_us=1e6).limits(1000.0, carrier=True)
-    assert (limits.rung, limits.update_map) == (Rung.NO_MAP, False), "a trial"
+    assert (limits.level, limits.update_map) == (DegradationLevel.NO_MAP, False), "a trial"
     budget = learned(1e6, map_us=1e6)
-    rungs = [budget.limits(1000.0, carrier=True).rung for _ in range(2 * PROBE_EVERY)]
-    assert rungs.count(Rung.CARRIED) == 2 * (PROBE_EVERY - PROBES)
-    assert rungs.count(Rung.NO_MAP) == 2 * PROBES, "now and then a scan is matched, to learn whether there is time"
+    levels = [budget.limits(1000.0, carrier=True).level for _ in range(2 * PROBE_EVERY)]
+    assert levels.count(DegradationLevel.CARRIED) == 2 * (PROBE_EVERY - PROBES)
+    assert levels.count(DegradationLevel.NO_MAP) == 2 * PROBES, (
+        "now and then a scan is matched, to learn whether there is time"
+    )
 
 
 def test_the_floor_is_kept_on_a_hopeless_machine_where_nothing_else_carries_the_pose() -> None:
     limits = learned(1e6, map_us=1e6).limits(1000.0)
-    assert limits == Limits(ENOUGH_ITERATIONS, FEWEST_POINTS, False, rung=Rung.NO_MAP)
+    assert limits == Limits(ENOUGH_ITERATIONS, FEWEST_POINTS, False, level=DegradationLevel.NO_MAP)
 
 
 def test_map_work_never_starves() -> None:
@@ -190,25 +200,29 @@ def test_all_the_rest_of_a_cycle_is_taken_from_the_budget_too() -> None:
 
 def test_what_is_left_out_is_taken_up_again_only_once_it_has_long_fitted() -> None:
     budget = learned(0.8, map_us=9000.0)
-    assert budget.limits(BUDGET_US).rung is Rung.NO_MAP
-    rungs = [budget.limits(BUDGET_US if k % 10 == 0 else 40_000.0).rung for k in range(60)]
-    assert set(rungs) == {Rung.NO_MAP}, "one cycle in ten that does not fit"
-    rungs = [budget.limits(40_000.0).rung for _ in range(60)]
-    assert sorted(set(rungs), reverse=True) == [Rung.NO_MAP, Rung.THINNED, Rung.FULL]
-    assert rungs == sorted(rungs, reverse=True), "one rung at a time"
+    assert budget.limits(BUDGET_US).level is DegradationLevel.NO_MAP
+    levels = [budget.limits(BUDGET_US if k % 10 == 0 else 40_000.0).level for k in range(60)]
+    assert set(levels) == {DegradationLevel.NO_MAP}, "one cycle in ten that does not fit"
+    levels = [budget.limits(40_000.0).level for _ in range(60)]
+    assert sorted(set(levels), reverse=True) == [
+        DegradationLevel.NO_MAP,
+        DegradationLevel.THINNED,
+        DegradationLevel.FULL,
+    ]
+    assert levels == sorted(levels, reverse=True), "one level at a time"
 
 
 def test_overruns_that_no_cost_explains_lead_down_where_that_helps() -> None:
-    def after(match_us: float) -> Rung:
+    def after(match_us: float) -> DegradationLevel:
         budget = MeasuredBudget()
         for k in range(40):
             limits = budget.limits(BUDGET_US)
             judge_us = 20_000.0 if k % 3 == 2 else 10.0
             budget.learn(Spent({"match": match_us, "judge": judge_us}, BUDGET_US), limits, step())
-        return Rung(budget.limits(BUDGET_US).rung)
+        return DegradationLevel(budget.limits(BUDGET_US).level)
 
-    assert after(9_000.0) > Rung.FULL
-    assert after(100.0) is Rung.FULL, "there is nothing to be had by matching less"
+    assert after(9_000.0) > DegradationLevel.FULL
+    assert after(100.0) is DegradationLevel.FULL, "there is nothing to be had by matching less"
 
 
 def test_replay_uses_the_recorded_caps_in_order() -> None:

@@ -13,19 +13,19 @@ import pytest
 from daemon.config.schema import LidarConfig
 from daemon.devices.conversion import ScanBridge
 from daemon.health.reasons import Reason
-from daemon.integrity.state_memory import Memory
 from daemon.runtime.budget import Budget, FixedBudget, MeasuredBudget, RecordedBudget
-from daemon.runtime.cycle import Cycle, CycleRecord, Parts
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import CycleRecord, Parts
 from daemon.runtime.scheduler import Pacemaker
-from daemon.runtime.snapshot_builder import Facts, Painter
+from daemon.runtime.stage_times import StageTimer
 from daemon.runtime.worker import CycleWorker, ScheduledWorker, Worker
 from daemon.snapshot import Snapshot, State
 from estimator import pipeline
 from estimator.measurements import Command, Job, Limits, Order, Record
-from estimator.result import Loop, StepResult
+from estimator.result import StepResult
 from hal.clock import LoopClock, run_virtual
 from hal.lidar import LidarStatus, Link, RawScan
-from tests.daemon.room import error, raw_odometry, raw_scan, rest
+from tests.daemon.support.room import error, raw_odometry, raw_scan, rest
 
 PERIOD = 0.1
 
@@ -68,7 +68,7 @@ class Bench:
             status=self.status,
             odometry=self.odometry,
             budget_us=self.budget_us,
-            stopwatch=self.stopwatch,
+            timer=StageTimer(self.stopwatch),
             sinks=[self.snapshots.append],
             tap=self.records.append,
         )
@@ -216,13 +216,13 @@ def test_no_odometry_is_lost_when_cycles_are_late() -> None:
 def test_odometry_that_jumps_is_no_witness_until_its_window_has_filled_again() -> None:
     async def jump(bench: Bench) -> None:
         await bench.drive(0, 50, odometry=True)
-        assert bench.cycle.observer.witnesses.agree() is True
+        assert bench.cycle.observer.motion_consistency.agree() is True
         bench.cycle.inbox.put_odometry(replace(raw_odometry(4.96), x=50.0))
         await asyncio.sleep(2 * PERIOD)
 
     bench = on_bench(jump, odometry=True)
     assert bench.cycle.odometry.jumps == 1
-    assert bench.cycle.observer.witnesses.agree() is None
+    assert bench.cycle.observer.motion_consistency.agree() is None
 
 
 def test_an_empty_cycle_makes_no_step() -> None:
@@ -389,36 +389,3 @@ def test_a_run_repeats_exactly_from_its_raw_streams_and_cycle_records() -> None:
     assert [(s.pose, s.odom, s.covariance, s.velocity, s.state) for s in second] == [
         (s.pose, s.odom, s.covariance, s.velocity, s.state) for s in first.snapshots
     ]
-
-
-def test_how_sure_a_guess_is_is_not_said() -> None:
-    """While the place in the map is looked for the pose goes on, and neither axes nor deviations are known."""
-    told = StepResult(
-        1.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.ones(3), None, -1, None, 0, np.zeros(3), 0
-    )
-    verdict = Memory(State.RELOCATING, known=(True, True, True))
-    sure, guess = (Painter().paint(replace(told, places=places), verdict, Facts()) for places in (None, 2))
-    assert sure.covariance is not None
-    assert sure.known == (True, True, True)
-    assert guess.pose is not None
-    assert guess.covariance is None
-    assert guess.known == (False, False, False)
-
-
-def test_a_loop_is_latched_until_somebody_has_seen_it() -> None:
-    told = StepResult(
-        1.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.ones(3), None, -1, None, 0, np.zeros(3), 0
-    )
-    painter, verdict = Painter(), Memory()
-
-    def latched(counter: int | None) -> bool:
-        loop = None if counter is None else Loop(counter, 9, 2, 0.01)
-        return painter.paint(replace(told, loop=loop), verdict, Facts()).loop_latched
-
-    assert [latched(None), latched(1), latched(None)] == [False, True, True]
-    painter.loop_seen = 1
-    assert [latched(None), latched(2)] == [False, True]
-    painter.loop_seen = 1
-    assert latched(None), "an acknowledgement that comes late loses no loop"
-    painter.loop_seen = 0
-    assert not latched(2**16), "the counter wraps"

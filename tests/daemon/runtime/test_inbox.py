@@ -14,8 +14,8 @@ from daemon.runtime.scan_period import IDLE_PERIOD_S, ScanPeriod
 from estimator.measurements import Command, Order
 from hal.imu import RawImu
 from hal.odometry import RawOdometry
-from tests.daemon.lightroom import raw_block
-from tests.daemon.room import URG, raw_scan
+from tests.daemon.support.light_room import raw_block
+from tests.daemon.support.room import URG, raw_scan
 
 SCAN = raw_scan(0, 0.0)
 
@@ -30,10 +30,10 @@ def test_taking_empties_it() -> None:
     inbox.put_odometry(RawOdometry(0, 0, 1, 2, 3))
     inbox.put_imu(RawImu(0, 0, 1))
     inbox.put_command(Command(0.0, Order.RESET))
-    taken = inbox.take()
+    taken = inbox.drain()
     assert taken.scan is SCAN
     assert (len(taken.odometry), len(taken.imu), len(taken.commands)) == (1, 1, 1)
-    empty = inbox.take()
+    empty = inbox.drain()
     assert (empty.scan, empty.odometry, empty.imu, empty.commands, empty.dropped) == (None, (), (), (), ())
     assert (empty.odometry_total, empty.imu_total) == (1, 1)
 
@@ -44,7 +44,7 @@ def test_the_first_and_the_last_odometry_survive_any_flood(count: int) -> None:
     for i in range(count):
         inbox.put_odometry(RawOdometry(i, i, i, 0, 0))
         inbox.put_imu(RawImu(i, i, 0))
-    taken = inbox.take()
+    taken = inbox.drain()
     assert taken.odometry_total == taken.imu_total == count
     assert len(taken.odometry) <= DEEPEST
     assert len(taken.imu) <= DEEPEST
@@ -58,10 +58,10 @@ def test_the_latest_few_blocks_wait_in_order_and_the_others_are_counted() -> Non
     inbox = Inbox()
     for seq in range(BLOCKS + 3):
         inbox.put_samples(raw_block(seq))
-    taken = inbox.take()
+    taken = inbox.drain()
     assert [block.seq for block in taken.samples] == list(range(3, BLOCKS + 3))
     assert (taken.samples_total, inbox.blocks_dropped) == (BLOCKS + 3, 3)
-    assert inbox.take().samples == ()
+    assert inbox.drain().samples == ()
     inbox.begin()
     assert inbox.blocks_dropped == 0, "before there was a cycle nothing was lost"
 
@@ -72,7 +72,7 @@ def test_scans_from_before_the_first_cycle_are_no_loss() -> None:
         inbox.put_scan(replace(SCAN, seq=seq))
     inbox.begin()
     assert inbox.dropped == 0
-    assert inbox.take().dropped == (0, 1, 2, 3), "a recording has to know them all the same"
+    assert inbox.drain().dropped == (0, 1, 2, 3), "a recording has to know them all the same"
 
 
 def test_the_period_is_idle_then_nominal_then_learned() -> None:
@@ -98,15 +98,15 @@ def test_one_sender_of_odometry_at_a_time(caplog: pytest.LogCaptureFixture) -> N
     passed: list[float] = []
     gate = OneSender(lambda reading: passed.append(reading.x))
     for i in range(10):
-        gate.take("UDP", RawOdometry(0.1 * i, 0.1 * i, 1.0, 0, 0))
-        gate.take("Modbus", RawOdometry(0.1 * i, 0.1 * i, 2.0, 0, 0))
+        gate.receive("UDP", RawOdometry(0.1 * i, 0.1 * i, 1.0, 0, 0))
+        gate.receive("Modbus", RawOdometry(0.1 * i, 0.1 * i, 2.0, 0, 0))
     assert passed == [1.0] * 10
-    gate.take("Modbus", RawOdometry(2.5, 2.5, 2.0, 0, 0))
+    gate.receive("Modbus", RawOdometry(2.5, 2.5, 2.0, 0, 0))
     assert passed[-1] == 2.0
     assert len([r for r in caplog.records if "is ignored" in r.message]) == 1
     for t in (103.0, 103.1):  # on another day it is news
-        gate.take("UDP", RawOdometry(t, t, 1.0, 0, 0))
-        gate.take("Modbus", RawOdometry(t, t, 2.0, 0, 0))
+        gate.receive("UDP", RawOdometry(t, t, 1.0, 0, 0))
+        gate.receive("Modbus", RawOdometry(t, t, 2.0, 0, 0))
     assert len([r for r in caplog.records if "is ignored" in r.message]) == 2
 
 

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daemon.runtime.histogram import Histogram
-from daemon.runtime.stage_times import NAMES, Laps, PulseTaker
+from daemon.runtime.stage_times import NAMES, StageTimer, TimingStatistics
 from daemon.snapshot import Stage
-from estimator.measurements import Rung
+from estimator.measurements import DegradationLevel
 
 
 @given(st.lists(st.integers(0, 10**9), min_size=1, max_size=300))
@@ -41,13 +41,13 @@ def test_what_is_older_than_two_halves_is_forgotten() -> None:
 
 def test_a_stage_that_comes_twice_adds_up_and_the_longest_is_named() -> None:
     ticks = iter([0.0, 0.001, 0.003, 0.006])
-    laps = Laps(lambda: next(ticks))
+    laps = StageTimer(lambda: next(ticks))
     laps.begin()
     for stage in ("match", "map", "match"):
         laps.lap(stage)
     assert laps.us == {"match": 4000, "map": 2000}
     assert laps.longest() is Stage.MATCH
-    quiet = Laps(None)
+    quiet = StageTimer(None)
     quiet.begin()
     quiet.lap("match")
     assert quiet.us == {}
@@ -55,11 +55,11 @@ def test_a_stage_that_comes_twice_adds_up_and_the_longest_is_named() -> None:
 
 
 def test_the_pulse_tells_each_stage_in_the_order_of_the_contract() -> None:
-    taker = PulseTaker()
+    taker = TimingStatistics()
     for k in range(100):
         taker.late(0.001)
         taker.on_cycle(0.025 * k, {"match": 300, "publish": 20})
-    pulse = taker.pulse
+    pulse = taker.latest
     assert pulse.cycle is not None
     assert 320 <= pulse.cycle[0] <= 340
     assert pulse.late is not None
@@ -72,10 +72,17 @@ def test_the_pulse_tells_each_stage_in_the_order_of_the_contract() -> None:
 
 
 def test_rungs_and_stalls_are_counted() -> None:
-    taker = PulseTaker()
-    for rung in (Rung.FULL, Rung.THINNED, Rung.NO_MAP, Rung.NO_MAP, Rung.CARRIED, Rung.FULL):
-        taker.on_rung(rung)
+    taker = TimingStatistics()
+    for rung in (
+        DegradationLevel.FULL,
+        DegradationLevel.THINNED,
+        DegradationLevel.NO_MAP,
+        DegradationLevel.NO_MAP,
+        DegradationLevel.CARRIED,
+        DegradationLevel.FULL,
+    ):
+        taker.on_level(rung)
     taker.stalled(0.2, Stage.MAP)
-    pulse = taker.pulse
+    pulse = taker.latest
     assert (pulse.rung, pulse.thinned, pulse.without_map, pulse.carried) == (0, 1, 2, 1)
     assert (pulse.stalls, pulse.stall_s, pulse.stall_in) == (1, 0.2, Stage.MAP)

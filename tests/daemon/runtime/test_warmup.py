@@ -20,8 +20,8 @@ from pathlib import Path
 
 import pytest
 
+from daemon.devices.light_setup import Lights
 from daemon.runtime import warmup
-from daemon.runtime.light_setup import Lights
 from daemon.runtime.warmup import Warmth, kernel_count, warm_up
 from daemon.system.kernel_lock import KernelLock, waits
 from estimator.cdma.air_interface import PROFILE_A
@@ -188,7 +188,7 @@ def test_a_start_loads_nothing_it_does_not_use(lit: bool) -> None:
     overrides = ("photodiode.bus=/dev/i2c-1",) if lit else ()
     code = (
         "import sys; import daemon.app; from daemon.runtime import warmup\n"
-        "from daemon.config.loader import load; from daemon.runtime.light_setup import load_lights\n"
+        "from daemon.config.loader import load; from daemon.devices.light_setup import load_lights\n"
         f"warmth = warmup.load(load_lights(load(None, {overrides}))); assert (warmth.code_us > 0) is {lit}\n"
         "print(warmth.compiled)\n"
         "heavy = {'scipy.linalg', 'scipy.sparse', 'scipy.spatial', 'pymodbus.server', 'serial', 'matplotlib'}\n"
@@ -307,7 +307,7 @@ def test_what_a_command_compiles_beyond_the_daemons_kernels_it_compiles_under_th
     taken: list[str] = []
     monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
     monkeypatch.setattr("estimator.numerics.jit_cache.CACHE_DIR", tmp_path)
-    monkeypatch.setattr(KernelLock, "take", lambda lock: taken.append("taken"))
+    monkeypatch.setattr(KernelLock, "acquire", lambda lock: taken.append("taken"))
     (tmp_path / "of_its_own.py").write_text("import numba\nnumba.njit('f8(f8)')(lambda x: x + 1.0)\n")
     monkeypatch.syspath_prepend(tmp_path)
     warmup.load_aloud(lambda text: None, "plan", lambda: taken.append("loaded"), "of_its_own")

@@ -10,19 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
-from daemon.cli.status import Reader
+from daemon.app import Daemon, Environment
 from daemon.config import loader
 from daemon.config.schema import Config
+from daemon.publish.modbus.client import Reader
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
 from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import UST_10LX, Unit
 from hal.fake.lidar.scan_world import Room
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.port.port import Port
-from tests.daemon.lightroom import Lit, plugged
+from tests.daemon.support.light_room import Lit, plugged
 
 EXAMPLES = sorted((Path(__file__).parents[3] / "systemd").glob("*.toml"))
 
@@ -88,7 +88,7 @@ def test_every_example_starts(file: Path) -> None:
         snapshots: list[Snapshot] = []
         buses, adc = plugged(clock, Lit((41, 49, 73, 81)), bus=settings.photodiode.bus)
         adc.add_level(lambda t_mono: np.full_like(t_mono, 0.4))
-        world = World(
+        world = Environment(
             clock,
             opener=open_whatever,
             make_worker=CycleWorker,

@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.cli import parser
 from daemon.config.schema import Config, LidarConfig, MapConfig, ModbusConfig
-from daemon.maps.store import started
+from daemon.maps.initial_state import started
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot, State
+from daemon.system import console
 from estimator.numerics import se2
 from hal.clock import LoopClock, run_virtual
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01
 from hal.fake.lidar.scan_world import COLUMN, ROOM, Room
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 
 pytestmark = pytest.mark.jit
 DEVICE = "/dev/ttyACM0"
@@ -56,7 +57,7 @@ def published(config: MapConfig, seconds: float) -> tuple[list[Snapshot], Room]:
         opener.plug(DEVICE, FakeHokuyo(URG_04LX_UG01, room))
         settings = Config(lidar=LidarConfig(device=DEVICE), modbus=ModbusConfig(port=0), map=config)
         store, start = started(config, None)
-        world = World(
+        world = Environment(
             clock,
             opener=opener,
             make_worker=CycleWorker,
@@ -84,11 +85,11 @@ def test_a_robot_in_an_imported_and_moved_map_is_where_it_says(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     maps = tmp_path / "maps"
-    assert parser.main(["map", "import", str(draw(tmp_path)), "--set", f"map.folder={maps}"]) == parser.OK
+    assert parser.main(["map", "import", str(draw(tmp_path)), "--set", f"map.folder={maps}"]) == console.OK
     (first,) = maps.glob("*.lumimap")
     points = se2.apply(MOVED, np.array([(0.0, 0.0), (7.0, 3.5)]))
     words = [f"--point=0,0={points[0, 0]},{points[0, 1]}", f"--point=7,3.5={points[1, 0]},{points[1, 1]}"]
-    assert parser.main(["map", "align", str(first), *words]) == parser.OK
+    assert parser.main(["map", "align", str(first), *words]) == console.OK
     map_id = int(capsys.readouterr().out.split()[-1], 16)
     snapshots, room = published(MapConfig(folder=str(maps), localise=True), 30.0)
     posed = [one for one in snapshots if one.pose is not None]

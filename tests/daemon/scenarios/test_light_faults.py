@@ -13,8 +13,8 @@ from daemon.snapshot import State
 from estimator.cdma.air_interface import PROFILE_A
 from hal.fake.adc.faults import ERRORS
 from hal.fake.lidar.models import URG_04LX_UG01
-from tests.daemon.lightroom import CODES, CURRENTS_A
 from tests.daemon.scenarios.test_lights import Bench, decoded, run_daemon
+from tests.daemon.support.light_room import CODES, CURRENTS_A
 
 
 @dataclass(frozen=True)

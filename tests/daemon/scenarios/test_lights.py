@@ -12,24 +12,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.endpoints import NO_DEVICE
 from daemon.config.schema import Config, LidarConfig, LightsConfig, ModbusConfig, PhotodiodeConfig
+from daemon.config.survey_loader import SurveyError
+from daemon.devices.light_setup import Lights, load_lights
 from daemon.devices.photodiode import BlockWatch
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.light_setup import Lights, SurveyError, load_lights
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import LightPicture, Snapshot
 from estimator.cdma.air_interface import PROFILE_A, PROFILE_B
 from hal.adc import AdcStatus
 from hal.clock import LoopClock, run_virtual
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01
 from hal.fake.lidar.scan_world import Room
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
-from tests.daemon.driven import during
-from tests.daemon.lightroom import BUS, CODES, SURVEY, Lit, plugged, raw_block
+from hal.fake.transport.memory_host import FakeOpener
+from tests.daemon.support.light_room import BUS, CODES, SURVEY, Lit, plugged, raw_block
+from tests.daemon.support.whole_daemon import during
 
 LIDAR = "/dev/ttyACM0"
 BLOCK_S = PROFILE_A.epoch_s
@@ -69,7 +70,7 @@ class Bench:
         self.opener = FakeOpener(clock)
         self.opener.plug(LIDAR, self.device)
         self.faults = FaultSchedule({"adc": self.adc})
-        self.world = World(
+        self.world = Environment(
             clock,
             opener=self.opener,
             make_worker=CycleWorker,

@@ -8,9 +8,9 @@ from daemon.health.reasons import Reason
 from daemon.runtime.budget import MeasuredBudget, RecordedBudget
 from daemon.runtime.worker import ScheduledWorker
 from daemon.snapshot import State
-from estimator.measurements import Rung
-from tests.daemon.room import error
+from estimator.measurements import DegradationLevel
 from tests.daemon.runtime.test_cycle import Bench, on_bench
+from tests.daemon.support.room import error
 
 pytestmark = pytest.mark.jit
 
@@ -45,7 +45,7 @@ def test_where_odometry_carries_the_pose_the_laser_is_left_out_and_that_is_said(
     bench = slow_for_a_while(odometry=True)
     slow = bench.snapshots[80:138]
     assert {(s.state, s.reason) for s in slow} == {(State.DEGRADED, Reason.OVERLOADED)}, "trials between do not flicker"
-    carried = [r.limits for r in bench.records if r.limits is not None and r.limits.rung == Rung.CARRIED]
+    carried = [r.limits for r in bench.records if r.limits is not None and r.limits.level == DegradationLevel.CARRIED]
     assert len(carried) > 50
     last = bench.snapshots[-1]
     assert last.state is State.TRACKING
@@ -53,13 +53,13 @@ def test_where_odometry_carries_the_pose_the_laser_is_left_out_and_that_is_said(
     assert last.pulse.rung == 0
     assert last.pulse.carried == len(carried)
     assert max(error(s.pose, s.t_mono)[0] for s in bench.snapshots[-50:] if s.pose is not None) < 0.02
-    assert bench.cycle.taker.short >= len(carried)
+    assert bench.cycle.timing.short >= len(carried)
 
 
 def test_where_nothing_else_carries_the_pose_scans_go_on_being_matched() -> None:
     bench = slow_for_a_while(odometry=False)
-    rungs = {r.limits.rung for r in bench.records if r.limits is not None}
-    assert rungs == {Rung.FULL, Rung.THINNED, Rung.NO_MAP}
+    levels = {r.limits.level for r in bench.records if r.limits is not None}
+    assert levels == {DegradationLevel.FULL, DegradationLevel.THINNED, DegradationLevel.NO_MAP}
     matched = [r.result.match for r in bench.records[80:138] if r.result is not None]
     assert all(match is not None and match.ok for match in matched)
     assert bench.snapshots[-1].state is State.TRACKING

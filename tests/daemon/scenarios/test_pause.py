@@ -8,7 +8,7 @@ from daemon.integrity.state_memory import Memory
 from daemon.runtime.budget import RecordedBudget
 from daemon.runtime.worker import ScheduledWorker
 from daemon.snapshot import State
-from estimator.measurements import Command, Order, Rung
+from estimator.measurements import Command, DegradationLevel, Order
 from estimator.result import Reason
 from tests.daemon.runtime.test_cycle import Bench, on_bench
 
@@ -29,7 +29,9 @@ def test_the_map_is_left_alone_and_the_laser_moves_nothing() -> None:
     ended = next(k for k, record in enumerate(bench.records) if k > begun and record.commands)
     during = bench.records[begun:ended]
     assert len(during) >= 25
-    assert all(r.limits is not None and r.limits.rung == Rung.CARRIED and not r.limits.update_map for r in during)
+    assert all(
+        r.limits is not None and r.limits.level == DegradationLevel.CARRIED and not r.limits.update_map for r in during
+    )
     assert all(r.result is not None and r.result.keyframe < 0 and not r.answers for r in during)
     seen = {r.result.match.reason for r in during if r.result is not None and r.result.match is not None}
     assert seen == {Reason.PASSED_OVER}

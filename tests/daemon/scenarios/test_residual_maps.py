@@ -16,16 +16,17 @@ import daemon.recording.disk_writer
 from daemon.config.residual_file import write_residuals
 from daemon.config.schema import Config, LightsConfig, PhotodiodeConfig
 from daemon.config.survey_loader import SurveyError, residuals_beside, write_survey
+from daemon.devices.light_setup import RESIDUALS, Lights, from_header, load_lights, lost_residuals
+from daemon.maps.initial_state import new_state
 from daemon.recording import disk_writer
 from daemon.recording.recorder import Recorder
-from daemon.runtime.light_setup import RESIDUALS, Lights, from_header, load_lights, lost_residuals, new_state
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.light_filter.residual_map import ResidualMap
 from estimator.light_filter.survey import Survey
 from hal.clock import SystemClock
 from hal.replay.recording import Kind, open_recording
-from tests.daemon.lightroom import BUS, SURVEY
 from tests.daemon.recording.test_recorder import wait_for
+from tests.daemon.support.light_room import BUS, SURVEY
 
 SHIFT = 0.1
 

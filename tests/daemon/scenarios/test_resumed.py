@@ -60,7 +60,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Poses, Poses
         first = await bench.until(State.MAPPING, 3.0)
         await asyncio.sleep(KILLED_S)
         saved: list[str] = []
-        bench.daemon.keeper.ask(saved.append)
+        bench.daemon.autosaver.ask(saved.append)
         while not saved:
             await asyncio.sleep(0.05)
             breathe()

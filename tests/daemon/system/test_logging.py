@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from daemon.health import journal_fields
 from daemon.health.assessment import Vitals
 from daemon.health.faults import FAULTS, Fault
 from daemon.runtime.heartbeat import OVER_S, Heartbeat
@@ -59,7 +60,7 @@ def logger_to(handler: logging.Handler) -> logging.Logger:
 
 def test_an_entry_carries_its_fields(tmp_path: Path, journal: socket.socket) -> None:
     handler = handler_to(tmp_path)
-    logger_to(handler).warning("lidar %s", "lost", extra=system_logging.of_fault(Fault.LIDAR_MISSING))
+    logger_to(handler).warning("lidar %s", "lost", extra=journal_fields.of_fault(Fault.LIDAR_MISSING))
     fields = unpacked(journal.recv(65536))
     handler.close()
     assert fields["MESSAGE"] == "lidar lost"
@@ -67,7 +68,7 @@ def test_an_entry_carries_its_fields(tmp_path: Path, journal: socket.socket) -> 
     assert fields["LUMILOOP_PART"] == "daemon.part"
     assert fields["LUMILOOP_FAULT"] == str(int(Fault.LIDAR_MISSING))
     assert fields["LUMILOOP_REMEDY"] == FAULTS[Fault.LIDAR_MISSING][1]
-    assert fields["MESSAGE_ID"] == system_logging.FAULT_ID
+    assert fields["MESSAGE_ID"] == journal_fields.FAULT_ID
     assert fields["CODE_FUNC"] == "test_an_entry_carries_its_fields"
 
 
@@ -146,7 +147,7 @@ def test_the_heartbeat_tells_faults_with_their_fields(caplog: pytest.LogCaptureF
         heartbeat._tell(Vitals(0.0), (Fault.OVERRUNS,))
         heartbeat._tell(Vitals(OVER_S), ())
     came, over = (record.__dict__["fields"] for record in caplog.records)
-    assert (came["MESSAGE_ID"], over["MESSAGE_ID"]) == (system_logging.FAULT_ID, system_logging.OVER_ID)
+    assert (came["MESSAGE_ID"], over["MESSAGE_ID"]) == (journal_fields.FAULT_ID, journal_fields.OVER_ID)
     assert came["LUMILOOP_FAULT_NAME"] == over["LUMILOOP_FAULT_NAME"] == "OVERRUNS"
     assert "LUMILOOP_REMEDY" in came
     assert "LUMILOOP_REMEDY" not in over
@@ -155,10 +156,10 @@ def test_the_heartbeat_tells_faults_with_their_fields(caplog: pytest.LogCaptureF
 def test_the_catalog_explains_every_message_id_with_fields_that_are_sent() -> None:
     text = CATALOG.read_text()
     explained = set(re.findall(r"^-- ([0-9a-f]{32})$", text, re.MULTILINE))
-    assert explained == {system_logging.FAULT_ID, system_logging.OVER_ID, system_logging.STATE_ID}
+    assert explained == {journal_fields.FAULT_ID, journal_fields.OVER_ID, journal_fields.STATE_ID}
     sent = {
-        *system_logging.of_fault(Fault.OVERRUNS)["fields"],
-        *system_logging.of_state("", "", "")["fields"],
+        *journal_fields.of_fault(Fault.OVERRUNS)["fields"],
+        *journal_fields.of_state("", "", "")["fields"],
         "MESSAGE",
     }
     assert set(re.findall(r"@(\w+)@", text)) <= sent

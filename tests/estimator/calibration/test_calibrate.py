@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.calibration.calibrate import Calibrated, TooLittle, calibrate
+from estimator.calibration.calibrate import Calibrated, TooLittle, calibrate_lamps
 from estimator.calibration.observations import Rows, joined, thinned
 from estimator.calibration.parameters import COMMONS, OWNS, Common, Own, Priors, linear, problem
 from estimator.light_filter.lambertian import expected
@@ -21,7 +21,7 @@ def taught(seed: int, error: float = 0.03, side: int = 3) -> tuple[Survey, Calib
     survey = nominal(side)
     truth = real(survey, seed)
     t, pose = drive(truth, seed + 50)
-    return truth, calibrate(survey, received(truth, t, pose, seed + 90, error))
+    return truth, calibrate_lamps(survey, received(truth, t, pose, seed + 90, error))
 
 
 def normalised(truth: Survey, found: Calibrated) -> np.ndarray:
@@ -77,8 +77,8 @@ def test_blocked_light_and_mirrors_are_left_out() -> None:
     blocked = (np.sin(0.5 * rows.t) > 0.8) & (rows.lamp % 3 == 0)
     bright = (np.sin(0.3 * rows.t) > 0.97) & (rows.lamp == 4)
     amplitude = rows.amplitude * np.where(blocked, 0.2, 1.0) * np.where(bright, 1.8, 1.0)
-    found = calibrate(survey, replace(rows, amplitude=amplitude))
-    clean = calibrate(survey, rows)
+    found = calibrate_lamps(survey, replace(rows, amplitude=amplitude))
+    clean = calibrate_lamps(survey, rows)
     for a, b in zip(found.survey.lamps, clean.survey.lamps, strict=True):
         assert abs(np.log(a.power_w / b.power_w)) < 0.02
     assert found.used.sum() < clean.used.sum()
@@ -90,7 +90,7 @@ def test_one_line_does_not_tell_everything() -> None:
     truth = real(survey, 6)
     x = np.linspace(0.3, 7.2, 600)
     pose = np.column_stack((x, np.full(600, 1.25), np.zeros(600)))
-    found = calibrate(survey, received(truth, x, pose, 7, 0.02))
+    found = calibrate_lamps(survey, received(truth, x, pose, 7, 0.02))
     told = {(e.lamp_id, e.name): e.told for e in found.estimates}
     after = {(e.lamp_id, e.name): e.after for e in found.estimates}
     assert told[None, "rx_x"]  # where a lamp is brightest
@@ -110,7 +110,7 @@ def test_where_the_drive_began_is_found() -> None:
     x, y = pose[:, 0] - 0.3, pose[:, 1] + 0.2
     there = np.column_stack((c * x - s * y, s * x + c * y, pose[:, 2] - 0.1))
     moved = replace(rows, pose=np.tile(there, (len(survey.lamps), 1)))
-    found = calibrate(survey, moved, Priors(frame=0.5, frame_yaw=0.3))
+    found = calibrate_lamps(survey, moved, Priors(frame=0.5, frame_yaw=0.3))
     assert found.T_survey_drive == pytest.approx([0.3, -0.2, 0.1], abs=0.03)
     sigma = {e.name: e.sigma for e in found.estimates if e.lamp_id is None}
     assert sigma["frame_x"] < 0.03
@@ -157,7 +157,7 @@ def test_too_little_is_said() -> None:
     survey = nominal(2)
     t, pose = drive(survey, 1, 4)
     with pytest.raises(TooLittle, match="at least 30"):
-        calibrate(survey, received(survey, t, pose, 1))
+        calibrate_lamps(survey, received(survey, t, pose, 1))
 
 
 @pytest.mark.parametrize("column", ["pose", "amplitude", "sigma"])

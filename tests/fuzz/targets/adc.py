@@ -11,9 +11,9 @@ import numpy as np
 from hal.adc import Blemish
 from hal.bus import i2c_frames as frames
 from hal.bus.i2c import Transferred, read, write
-from hal.photodiode.adapter_limits import Capability
+from hal.photodiode.adapter_limits import AdapterLimits
 from hal.photodiode.block_check import inspect
-from hal.photodiode.diagnosis import Judge
+from hal.photodiode.diagnosis import BlockDiagnosis
 from hal.photodiode.mcp3221 import CHIP
 from hal.photodiode.sampler import Sampler
 from tests.fuzz.targets import refused
@@ -58,17 +58,17 @@ def mend(data: bytes) -> bytes:
 
 def feeder() -> Callable[[bytes], None]:
     state = {"t": 0.0, "seq": 0, "level": 0.0}
-    sampler = Sampler(CHIP, Capability(LENGTH, SPAN, 28 / SCL + 60e-6))
-    judge = Judge("x", CHIP, 0x4D, lambda: state["level"] or None)
+    sampler = Sampler(CHIP, AdapterLimits(LENGTH, SPAN, 28 / SCL + 60e-6))
+    diagnosis = BlockDiagnosis("x", CHIP, 0x4D, lambda: state["level"] or None)
     whole = seeds()[0]
 
     def block(data: bytes) -> bool:
         late = (len(data) % 7) * 1e-3
         state["seq"] += 1 + len(data) % 3
         t = state["t"]
-        taken, census = sampler.take(Transferred(t, t + SPAN + late, (data,)), int(state["seq"]))
-        state["level"] = census.clipped
-        verdict = judge.look(taken, census)
+        taken, defects = sampler.to_block(Transferred(t, t + SPAN + late, (data,)), int(state["seq"]))
+        state["level"] = defects.clipped
+        verdict = diagnosis.add(taken, defects)
         state["t"] = t + SPAN + late + 1e-4
         assert taken.words.size <= LENGTH // 2
         assert taken.words.size == 0 or 0 <= int(taken.words.min()) <= int(taken.words.max()) <= 4095

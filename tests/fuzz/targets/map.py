@@ -10,7 +10,7 @@ from daemon.maps.container import HEAD, ROW, BadMap
 from daemon.maps.image import image_from
 from daemon.maps.schema import read, summary
 from estimator.stored_map import restored
-from tests.daemon.mapmaker import Shape, content
+from tests.daemon.support.map_maker import Shape, content
 from tests.fuzz.targets import refused
 
 MEGABYTES = 3

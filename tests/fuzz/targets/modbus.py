@@ -7,7 +7,7 @@ import struct
 import weakref
 from collections.abc import Callable
 
-from daemon.publish.modbus import registers, rtu_frames, server
+from daemon.publish.modbus import counts, registers, rtu_frames, tcp_endpoint
 from daemon.publish.modbus.requests import MAX_FRAME, frame_size
 from hal.clock import VirtualLoop
 from hal.net.fair_share import Share
@@ -57,7 +57,7 @@ def feeder() -> Callable[[bytes], None]:
     loop, answering = VirtualLoop(), responder()
 
     async def stream(data: bytes) -> None:
-        endpoint = server.TcpEndpoint(responder(), server.Counts(), share=Share(loop.time))
+        endpoint = tcp_endpoint.TcpEndpoint(responder(), counts.Counts(), share=Share(loop.time))
         connection, wire = plugged(endpoint)
         expected, faulty = whole_frames(data)
         cut = len(data) * 2 // 3
@@ -75,10 +75,10 @@ def feeder() -> Callable[[bytes], None]:
 
     def serial(data: bytes) -> None:
         line = rtu_frames.RtuFrames(1)
-        for unit, body in [*line.take(data[:99]), *line.take(data[99:])]:
+        for unit, body in [*line.feed(data[:99]), *line.feed(data[99:])]:
             assert unit in (0, 1)
             check_answer(framed(1, unit, body), answering.answer(framed(1, unit, body)))
-        assert any(line.take(rtu_frames.framed(1, READ[7:])) == [(1, READ[7:])] for _ in range(2))
+        assert any(line.feed(rtu_frames.framed(1, READ[7:])) == [(1, READ[7:])] for _ in range(2))
 
     def feed(data: bytes) -> None:
         size = frame_size(data)

@@ -13,14 +13,14 @@ from pathlib import Path
 import msgspec
 
 from daemon.maps.tiles import MapTiles
-from daemon.publish.stream_client import BUFFER_BYTES
-from daemon.publish.stream_server import TOPICS, Client, StreamServer, framed
+from daemon.publish.stream.server import TOPICS, Client, StreamServer, framed
+from daemon.publish.stream.session import BUFFER_BYTES
 from hal.clock import VirtualLoop
 from hal.net.fair_share import Share
 from tests.daemon.publish.modbus.test_registers import snapshot
 
 MEGABYTES = 10
-PARSERS = ("daemon/publish/stream_client.py",)
+PARSERS = ("daemon/publish/stream/session.py",)
 TILES, TILE_SIZE = 400, 600
 """Of the map: as many as of a large hall."""
 TURN_S = 0.04

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from daemon.config import loader, survey_loader
 from daemon.config.schema import Config
 from daemon.maps import map_server
-from tests.daemon.mapmaker import SURVEY
+from tests.daemon.support.map_maker import SURVEY
 from tests.fuzz.targets import a_file, refused
 
 MEGABYTES = 3

@@ -54,7 +54,7 @@ def feeder() -> Callable[[bytes], None]:
     def feed(data: bytes) -> None:
         state["t"] += 0.01
         state["fed"] += 1
-        port.take(data, state["t"])
+        port.receive(data, state["t"])
         counts = port.counts.values()
         assert sum(c.received + c.late + c.duplicate + c.foreign for c in counts) + port.invalid == state["fed"]
         for reading in (*odometry, *imu):

@@ -9,11 +9,11 @@ from itertools import pairwise
 import pytest
 
 from hal.bus.i2c import AsyncBus, Message, Transferred, check, read, write
+from hal.bus.opening import blocking_opener, open_bus
 from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceMissing, DeviceRefused
 from hal.fake.adc.converter import FakeAdc, FakeBuses
-from hal.fake.schedule import FaultSchedule
-from hal.port.opening import blocking_opener, open_bus
+from hal.fake.faults.schedule import FaultSchedule
 
 
 @pytest.mark.parametrize("name", ["", "1", "i2c-1", "serial:/dev/ttyACM0", "http://x", "udp://127.0.0.1:1"])

@@ -13,9 +13,9 @@ import pytest
 import hal.bus.i2c_linux
 from hal.bus.i2c import NACKS, read, write
 from hal.bus.i2c_linux import open_linux
+from hal.bus.opening import open_bus
 from hal.errors import DeviceMissing, DeviceRefused
-from hal.port.opening import open_bus
-from tests.hal.i2c_kernel import I2C_FUNC_SMBUS, kernel
+from tests.hal.bus.i2c_kernel import I2C_FUNC_SMBUS, kernel
 
 
 @pytest.fixture

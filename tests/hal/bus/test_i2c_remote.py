@@ -22,12 +22,12 @@ from hal.bus import i2c_frames as frames
 from hal.bus.i2c import read, write
 from hal.bus.i2c_remote import RemoteClock, clock_name, open_remote, parse_address
 from hal.bus.i2c_server import BusServer
+from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.fake.adc.converter import FakeAdc, FakeBuses
-from hal.fake.schedule import FaultSchedule
+from hal.fake.faults.schedule import FaultSchedule
 from hal.photodiode.driver import PhotodiodeAdc
-from hal.port.opening import open_bus
 from tests.hal.photodiode.bench import Bench, Light, falsehoods
 
 KINDS = ("unix", "tcp")
@@ -374,10 +374,10 @@ def test_times_of_another_computer_are_translated(tmp_path: Path) -> None:
 
 def test_the_difference_of_clocks_is_bounded_from_both_sides() -> None:
     clock = RemoteClock(same=False)
-    clock.learn(ordered=10.0, received=110.5, sent=110.6, answered=10.7)  # between 99.9 and 100.5
-    clock.learn(ordered=20.0, received=120.2, sent=120.3, answered=20.4)  # between 99.9 and 100.2
-    assert clock.ours(150.05) == pytest.approx(50.0)
-    assert RemoteClock(same=True).ours(5.0) == 5.0
+    clock.add(ordered=10.0, received=110.5, sent=110.6, answered=10.7)  # between 99.9 and 100.5
+    clock.add(ordered=20.0, received=120.2, sent=120.3, answered=20.4)  # between 99.9 and 100.2
+    assert clock.to_local(150.05) == pytest.approx(50.0)
+    assert RemoteClock(same=True).to_local(5.0) == 5.0
 
 
 @pytest.mark.parametrize(

@@ -18,11 +18,11 @@ from hal.bus import i2c_frames as frames
 from hal.bus.i2c import read, write
 from hal.bus.i2c_remote import RemoteClock, open_remote
 from hal.bus.i2c_server import CLIENTS, BusServer
+from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.fake.adc.converter import FakeBuses
 from hal.photodiode.driver import PhotodiodeAdc
-from hal.port.opening import open_bus
 from tests.hal.bus.test_i2c_remote import Server, greet, served
 
 Reads = tuple[bytes, ...]
@@ -44,11 +44,11 @@ def lie(reads: Reads = (bytes(2),), number: int = 1, shift: float = 0.0) -> Call
 @pytest.mark.parametrize(
     ("behave", "says"),
     [
-        (lie(reads=()), r"reads of \(\) bytes where \(2,\) were ordered"),
-        (lie(reads=(bytes(2), bytes(2))), "were ordered"),
-        (lie(reads=(bytes(3),)), "were ordered"),
-        (lie(number=7), "an order 7 that there is not"),
-        (lie(shift=-10.0), "times from before the order"),
+        (lie(reads=()), r"reads of \(\) bytes where \(2,\) were requested"),
+        (lie(reads=(bytes(2), bytes(2))), "were requested"),
+        (lie(reads=(bytes(3),)), "were requested"),
+        (lie(number=7), "an answer to request 7"),
+        (lie(shift=-10.0), "times from before the request"),
         (lie(shift=10.0), "or after the answer"),
     ],
 )
@@ -106,11 +106,11 @@ def test_the_driver_survives_any_server(tmp_path: Path) -> None:
 def test_a_step_of_the_other_clock_is_followed() -> None:
     clock = RemoteClock(same=False)
     for k in range(10):
-        clock.learn(k + 0.0, k + 100.01, k + 100.02, k + 0.03)
-    assert clock.ours(150.0) == pytest.approx(50.0, abs=0.02)
+        clock.add(k + 0.0, k + 100.01, k + 100.02, k + 0.03)
+    assert clock.to_local(150.0) == pytest.approx(50.0, abs=0.02)
     for k in range(10, 12):
-        clock.learn(k + 0.0, k + 700.01, k + 700.02, k + 0.03)
-    assert clock.ours(750.0) == pytest.approx(50.0, abs=0.02)
+        clock.add(k + 0.0, k + 700.01, k + 700.02, k + 0.03)
+    assert clock.to_local(750.0) == pytest.approx(50.0, abs=0.02)
 
 
 def server() -> BusServer:

@@ -236,7 +236,7 @@ def test_a_loop_that_has_ended_ends_a_thread_without_work() -> None:
 
 
 def test_opening_a_bus_that_is_not_there() -> None:
-    from hal.port.opening import open_bus
+    from hal.bus.opening import open_bus
 
     with pytest.raises(DeviceMissing, match="no such bus"):
         asyncio.run(open_bus("/dev/i2c-250"))

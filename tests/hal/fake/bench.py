@@ -14,12 +14,12 @@ import numpy as np
 
 from hal.clock import LoopClock, run_virtual
 from hal.errors import HalError
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import UTM_30LX, LidarModel, Unit
 from hal.fake.lidar.rotor import Rotor
 from hal.fake.lidar.scan import FakeScan, ScanSource
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.port.port import Port
 
 T = TypeVar("T")

@@ -9,7 +9,7 @@ import pytest
 
 from hal.fake.adc.faults import ADC
 from hal.fake.adc.i2c_adapters import ADAPTERS
-from hal.fake.faults import Vocabulary
+from hal.fake.faults.orders import Vocabulary
 from hal.fake.lidar.faults import LIDAR
 from hal.fake.lidar.models import MODELS
 

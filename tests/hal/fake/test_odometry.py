@@ -8,9 +8,9 @@ import math
 import pytest
 
 from hal.clock import run_virtual
-from hal.fake.faults import FaultError
+from hal.fake.faults.orders import FaultError
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.odometry import ODOMETRY, FakeOdometry
-from hal.fake.schedule import FaultSchedule
 from hal.net.input_codec import InputDatagram, decode
 
 HZ, SPEED = 50.0, 0.5

@@ -21,14 +21,14 @@ import serial
 
 from hal.errors import DataInvalid, DeviceMissing, DeviceRefused
 from hal.fake.__main__ import main
-from hal.fake.control import Control, serve_control
+from hal.fake.faults.control import Control, serve_control
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import MODELS, URG_04LX, UST_10LX, UTM_30LX, LidarModel
 from hal.fake.lidar.scan_world import NO_OBJECT, RecordedRanges, Room
-from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule
-from hal.fake.tcp_server import TcpServer
+from hal.fake.transport.pty_server import PtyServer
+from hal.fake.transport.tcp_server import TcpServer
 from tests.hal.fake.bench import ramp, read
 
 ROOT = Path(__file__).parents[3]
@@ -105,7 +105,7 @@ def test_pty_goes_on_when_the_host_leaves_and_nothing_stale_is_left(tmp_path: Pa
         with opened(server.path) as port:
             port.write(MD)
             await gather(port, 3)
-        await until(lambda: device.counts.unheard > 20)
+        await until(lambda: device.counts.without_host > 20)
         assert device.state is State.MULTI
         before = device.scans_sent
         with opened(server.path) as port:
@@ -245,7 +245,7 @@ def test_tcp_one_host_at_a_time_and_a_closed_connection_stops_the_sensor() -> No
             assert len(read(reply).values()) == 1081
             async with Client(port) as second:
                 assert await second.end()
-            assert server.turned_away == 1
+            assert server.rejected == 1
             assert read(await first.reply()).status == "99"
         await until(lambda: device.state is State.IDLE)
         async with Client(port) as third:

@@ -10,11 +10,11 @@ import numpy as np
 
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual
 from hal.errors import HalError
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import UTM_30LX, LidarModel, Unit
 from hal.fake.lidar.scan import FakeScan
-from hal.fake.schedule import FaultSchedule
-from hal.fake.transport import FakeOpener
+from hal.fake.transport.memory_host import FakeOpener
 from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import RawScan
 from hal.port.opening import open_port

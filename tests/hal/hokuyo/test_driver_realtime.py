@@ -12,12 +12,12 @@ import pytest
 
 from hal.clock import SystemClock
 from hal.errors import DeviceMissing
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import UST_10LX, UTM_30LX, LidarModel
-from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule
-from hal.fake.tcp_server import TcpServer
+from hal.fake.transport.pty_server import PtyServer
+from hal.fake.transport.tcp_server import TcpServer
 from hal.hokuyo.passive import PassiveHokuyo
 from hal.hokuyo.payload import ScanRequest, parse_scan
 from hal.hokuyo.scip import FrameSplitter, parse_reply

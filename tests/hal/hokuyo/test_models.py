@@ -89,9 +89,9 @@ def test_firmware_from_before_scip_2() -> None:
 def test_families(name: str, family: str, line: str) -> None:
     facts = facts_of(MODELS[name].prod, MODELS[name].modl)
     assert (facts.family, facts.line) == (family, line)
-    assert facts.may("MD")
-    assert facts.may("ME") is (family not in ("URG-04LX", "UBG-04LX", "UHG-08LX"))
-    assert facts.may("RB") is (line == "ethernet")
+    assert facts.allows("MD")
+    assert facts.allows("ME") is (family not in ("URG-04LX", "UBG-04LX", "UHG-08LX"))
+    assert facts.allows("RB") is (line == "ethernet")
 
 
 def test_unknown_models_and_the_ethernet_utm() -> None:

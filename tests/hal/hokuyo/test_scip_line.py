@@ -31,7 +31,7 @@ def test_a_question_is_flushed_before_and_answered_by_its_echo_alone() -> None:
         loop = asyncio.get_running_loop()
         loop.call_later(0.1, sensor.write, b"VV\n00P\n\nQT\n99b\n\nQT\n0")
         loop.call_later(0.2, sensor.write, b"0P\n\nQT\n00P\n\n")
-        assert await line.ask(scip.QT, 1.0) == b"QT\n00P"
+        assert await line.exchange(scip.QT, 1.0) == b"QT\n00P"
         assert heard == [b"\nQT\n"]
         assert others == [b"VV\n00P", b"QT\n99b", b"QT\n00P"]  # a second answer to it is nobody's
 
@@ -41,10 +41,10 @@ def test_a_question_is_flushed_before_and_answered_by_its_echo_alone() -> None:
 def test_no_answer_in_time() -> None:
     async def body(line: Line, sensor: MemoryPort, heard: list[bytes]) -> None:
         with pytest.raises(TimeoutError):
-            await line.ask(scip.VV, 0.5)
+            await line.exchange(scip.VV, 0.5)
         sensor.write(b"VV\n00P\n\n")  # too late: must not answer the next question
         asyncio.get_running_loop().call_later(0.1, sensor.write, b"PP\n00P\n\n")
-        assert await line.ask(scip.PP, 0.5) == b"PP\n00P"
+        assert await line.exchange(scip.PP, 0.5) == b"PP\n00P"
 
     with_line(body)
 
@@ -65,14 +65,14 @@ def test_what_is_readable_is_told_from_noise() -> None:
 def test_loss_reaches_a_question_under_way_and_every_later_one() -> None:
     async def body(line: Line, sensor: MemoryPort, heard: list[bytes]) -> None:
         told: list[str] = []
-        line.when_lost(lambda: told.append("first"))
+        line.set_on_lost(lambda: told.append("first"))
         asyncio.get_running_loop().call_later(0.1, sensor.close)
         with pytest.raises(DeviceMissing):
-            await line.ask(scip.VV, 1.0)
+            await line.exchange(scip.VV, 1.0)
         with pytest.raises(DeviceMissing):
-            await line.ask(scip.VV, 1.0)
-        line.when_lost(lambda: told.append("late"))
-        line.when_lost(None)
+            await line.exchange(scip.VV, 1.0)
+        line.set_on_lost(lambda: told.append("late"))
+        line.set_on_lost(None)
         assert told == ["first", "late"]
         assert isinstance(line.lost, DeviceMissing)
         line.close()

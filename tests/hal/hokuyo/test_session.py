@@ -23,7 +23,7 @@ class Scripted:
 
     def __init__(self, **replies: list[str | bytes | None]) -> None:
         self.replies = {name.replace("_", "."): list(said) for name, said in replies.items()}
-        self.heard: list[str] = []
+        self.received: list[str] = []
         self.bauds: list[int] = []
 
     def plug(self, port: MemoryPort) -> None:
@@ -36,7 +36,7 @@ class Scripted:
                 self._answer(line.decode())
 
     def _answer(self, line: str) -> None:
-        self.heard.append(line)
+        self.received.append(line)
         self.bauds.append(self.port.peer_baud)
         said = self.replies.get(line) or self.replies.get(line[:2]) or [None]
         reply = said.pop(0) if len(said) > 1 else said[0]
@@ -66,36 +66,36 @@ class TestSettle:
     def test_idle(self) -> None:
         script = Scripted(QT=[OK])
         self.run(script)
-        assert script.heard == ["QT"]
+        assert script.received == ["QT"]
 
     def test_qt_ignored_twice(self) -> None:
         script = Scripted(QT=[None, None, OK])
         self.run(script)
-        assert script.heard == ["QT"] * 3
+        assert script.received == ["QT"] * 3
 
     @pytest.mark.parametrize("status", ["0E", "10"])
     def test_time_adjustment(self, status: str) -> None:
         script = Scripted(QT=[status, OK], TM2=[OK])
         self.run(script)
-        assert script.heard == ["QT", "TM2", "QT"]
+        assert script.received == ["QT", "TM2", "QT"]
 
     @pytest.mark.parametrize("answer", [b"QT\nE\n\n", b"QT\n0\n\n"])
     @pytest.mark.parametrize("switch", [b"SCIP2.0\n0\n\n", b"SCIP2.0\n0Ee\n\n", None])
     def test_scip_1(self, answer: bytes, switch: bytes | None) -> None:
         script = Scripted(QT=[answer, OK], SCIP2_0=[switch])
         self.run(script)
-        assert script.heard == ["QT", "SCIP2.0", "QT"]
+        assert script.received == ["QT", "SCIP2.0", "QT"]
 
     def test_a_damaged_reply_is_asked_for_again(self) -> None:
         script = Scripted(QT=[b"QT\n00Q\n\n", OK])
         self.run(script)
-        assert script.heard == ["QT", "QT"]
+        assert script.received == ["QT", "QT"]
 
     def test_frames_of_a_running_stream_are_passed_over(self) -> None:
         frame = encoder.scan("MD0000000201000", 1, "0CB1Dh7D`")
         script = Scripted(QT=[frame[7:] + frame + frame + encoder.answer("QT", OK)])
         self.run(script)
-        assert script.heard == ["QT"]
+        assert script.received == ["QT"]
 
     def test_mute(self) -> None:
         with pytest.raises(DeviceFault, match=r"/dev/x: nothing answers .*HOKUYO"):
@@ -146,7 +146,7 @@ class TestReset:
     def test_before_anything_is_known_only_rs(self) -> None:
         script = Scripted(RS=[None, OK], QT=[OK])
         with_session(script, lambda session: session.reset())
-        assert script.heard == ["RS", "RS", "QT"]
+        assert script.received == ["RS", "RS", "QT"]
 
     def test_a_model_that_has_rt_keeps_its_rate(self) -> None:
         script = Scripted(RT=[OK], QT=[OK], **GOOD)
@@ -156,8 +156,8 @@ class TestReset:
             await session.reset()
 
         with_session(script, body)
-        assert "RT" in script.heard
-        assert "RS" not in script.heard
+        assert "RT" in script.received
+        assert "RS" not in script.received
 
     def test_rs_on_a_serial_line_means_finding_the_rate_again(self) -> None:
         script = Scripted(RS=[OK], QT=[None, None, OK])
@@ -178,7 +178,7 @@ class TestReset:
         async def body(session: Session) -> None:
             began = asyncio.get_running_loop().time()
             await session.reboot()
-            assert script.heard == ["RB", "RB"]
+            assert script.received == ["RB", "RB"]
             assert asyncio.get_running_loop().time() - began < 4.0
             script.port.close()
             await asyncio.sleep(0)
@@ -196,7 +196,7 @@ class TestIdentify:
             assert (who.geometry.serial, session.health) == ("H0900001", "Sensor works well.")
 
         with_session(script, body)
-        assert script.heard == ["VV", "PP", "II"]
+        assert script.received == ["VV", "PP", "II"]
 
     def test_without_ii(self) -> None:
         async def body(session: Session) -> None:
@@ -208,7 +208,7 @@ class TestIdentify:
     def test_left_in_time_adjustment_by_firmware_that_grants_qt_there(self) -> None:
         script = Scripted(VV=["0E", *GOOD["VV"]], PP=GOOD["PP"], TM2=[OK], QT=[OK])
         with_session(script, lambda session: session.identify())  # type: ignore[arg-type, return-value]  # result unused
-        assert script.heard[:3] == ["VV", "TM2", "QT"]
+        assert script.received[:3] == ["VV", "TM2", "QT"]
 
     def test_damaged_once(self) -> None:
         damaged = GOOD["PP"][0].replace(b"1080", b"1081")
@@ -218,7 +218,7 @@ class TestIdentify:
             assert (await session.identify()).geometry.amax == 1080
 
         with_session(script, body)
-        assert script.heard.count("PP") == 2
+        assert script.received.count("PP") == 2
 
     def test_the_same_wrong_sum_twice_is_the_firmwares_own_way(self) -> None:
         odd = GOOD["VV"][0].replace(b"SERI:H0900001;" + GOOD["VV"][0].rstrip()[-1:], b"SERI:H0900001;0")
@@ -228,7 +228,7 @@ class TestIdentify:
             assert (await session.identify()).geometry.serial == "H0900001"
 
         with_session(script, body)
-        assert script.heard.count("VV") == 2
+        assert script.received.count("VV") == 2
 
     def test_never_readable(self) -> None:
         replies: list[str | bytes | None] = [GOOD["VV"][0].replace(b"H0900001", b"H090000%d" % i) for i in range(2, 9)]
@@ -250,7 +250,7 @@ class TestRate:
             assert session.baud == 250000
 
         with_session(script, body, baud=19200)
-        assert script.heard == ["SS250000", "VV"]
+        assert script.received == ["SS250000", "VV"]
         assert script.bauds == [19200, 250000]
 
     @pytest.mark.parametrize("status", ["02", "04", "0F", None])
@@ -281,7 +281,7 @@ class TestRate:
             port.set_baud = limited  # type: ignore[method-assign]  # an adapter with limits
             with pytest.raises(DeviceRefused):
                 await session.set_rate(250000)
-            assert script.heard == []
+            assert script.received == []
             assert port.baud == 19200
             await session.find_rate(750000)
             assert session.baud == 19200
@@ -333,12 +333,12 @@ class TestStart:
         data = encoder.scan(self.line, 1, "0CB1Dh7D`")
         script = Scripted(MD=[encoder.answer(self.line, OK) + data])
         assert self.start(script) == [data[:-2]]
-        assert script.heard == [self.line]
+        assert script.received == [self.line]
 
     def test_acknowledgement_lost_but_data_come(self) -> None:
         script = Scripted(MD=[encoder.scan(self.line, 1, "0CB1Dh7D`")])
         assert len(self.start(script, scans=True)) == 1
-        assert script.heard == [self.line]
+        assert script.received == [self.line]
 
     def test_no_answer_at_all(self) -> None:
         with pytest.raises(DeviceFault, match="does not acknowledge MD"):

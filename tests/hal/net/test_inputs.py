@@ -20,7 +20,7 @@ from hal.clock import SystemClock
 from hal.errors import DataInvalid, DeviceRefused
 from hal.imu import RawImu
 from hal.net.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, SHARED_CLOCK, InputDatagram, decode, encode
-from hal.net.inputs import CALM_S, MAX_AGE_S, SESSION_TIMEOUT_S, Continuity, InputPort
+from hal.net.inputs import ABSENT_S, MAX_AGE_S, SESSION_TIMEOUT_S, Continuity, InputPort
 from hal.odometry import RawOdometry
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -44,9 +44,9 @@ class Listening:
         self.port.send_imu_to(self.imu.append)
         self.t = 100.0
 
-    def take(self, data: bytes, after: float = 0.05) -> None:
+    def receive(self, data: bytes, after: float = 0.05) -> None:
         self.t += after
-        self.port.take(data, self.t)
+        self.port.receive(data, self.t)
 
     @property
     def poses(self) -> list[tuple[float, float, float]]:
@@ -107,7 +107,7 @@ def test_what_is_wrong_is_said(change: Callable[[bytes], bytes], words: str) -> 
 def test_loss_repetition_and_overtaking_are_told_apart() -> None:
     listening = Listening()
     for seq in (10, 11, 11, 14, 13, 15):
-        listening.take(datagram(seq, (seq, 0.0, 0.0)))
+        listening.receive(datagram(seq, (seq, 0.0, 0.0)))
     assert [o.x for o in listening.odometry] == [10.0, 11.0, 14.0, 15.0]
     counts = listening.port.counts["odometry"]
     assert (counts.received, counts.lost, counts.duplicate, counts.late) == (4, 2, 1, 1)
@@ -116,7 +116,7 @@ def test_loss_repetition_and_overtaking_are_told_apart() -> None:
 def test_the_numbering_wraps() -> None:
     listening = Listening()
     for seq in (2**32 - 2, 2**32 - 1, 0, 1):
-        listening.take(datagram(seq))
+        listening.receive(datagram(seq))
     assert listening.port.counts["odometry"].received == 4
     assert listening.port.counts["odometry"].lost == 0
 
@@ -124,7 +124,7 @@ def test_the_numbering_wraps() -> None:
 def test_damage_is_counted_and_dropped() -> None:
     listening = Listening()
     for data in (b"", b"LUOD", bytes(60), datagram(1)[:-1]):
-        listening.take(data)
+        listening.receive(data)
     assert listening.port.invalid == 4
     assert listening.odometry == []
 
@@ -132,8 +132,8 @@ def test_damage_is_counted_and_dropped() -> None:
 def test_both_kinds_are_numbered_apart() -> None:
     listening = Listening()
     for seq in (5, 6):
-        listening.take(datagram(seq))
-        listening.take(encode(InputDatagram(IMU_MAGIC, 1, seq, 0, 0.0, (0.5,))))
+        listening.receive(datagram(seq))
+        listening.receive(encode(InputDatagram(IMU_MAGIC, 1, seq, 0, 0.0, (0.5,))))
     assert len(listening.odometry) == len(listening.imu) == 2
     assert listening.imu[0].yaw_rate == 0.5
     assert listening.port.counts["imu"].lost == 0
@@ -146,10 +146,10 @@ def test_both_kinds_are_numbered_apart() -> None:
 def test_a_restarted_sender_makes_no_jump(session: int) -> None:
     """It begins again at its origin, heading elsewhere; what is delivered goes on from where it was."""
     listening = Listening()
-    listening.take(datagram(1000, (5.0, 0.0, 0.0)))
-    listening.take(datagram(1001, (5.0, 1.0, math.pi / 2)))
-    listening.take(datagram(1, (0.0, 0.0, 0.0), session), after=SESSION_TIMEOUT_S + 0.1)
-    listening.take(datagram(2, (1.0, 0.0, 0.0), session))
+    listening.receive(datagram(1000, (5.0, 0.0, 0.0)))
+    listening.receive(datagram(1001, (5.0, 1.0, math.pi / 2)))
+    listening.receive(datagram(1, (0.0, 0.0, 0.0), session), after=SESSION_TIMEOUT_S + 0.1)
+    listening.receive(datagram(2, (1.0, 0.0, 0.0), session))
     assert listening.poses[1:] == [
         (5.0, 1.0, round(math.pi / 2, 9)),
         (5.0, 1.0, round(math.pi / 2, 9)),
@@ -160,9 +160,9 @@ def test_a_restarted_sender_makes_no_jump(session: int) -> None:
 
 def test_a_quick_restart_under_the_same_session_is_taken_after_the_timeout() -> None:
     listening = Listening()
-    listening.take(datagram(1000, (5.0, 0.0, 0.0)))
+    listening.receive(datagram(1000, (5.0, 0.0, 0.0)))
     for seq in range(1, 40):
-        listening.take(datagram(seq, (float(seq), 0.0, 0.0)))
+        listening.receive(datagram(seq, (float(seq), 0.0, 0.0)))
     counts = listening.port.counts["odometry"]
     assert counts.late == pytest.approx(SESSION_TIMEOUT_S / 0.05, abs=1)
     assert counts.restarts == 1
@@ -174,8 +174,8 @@ def test_a_quick_restart_under_the_same_session_is_taken_after_the_timeout() -> 
 def test_a_second_sender_is_ignored_while_the_first_is_heard() -> None:
     listening = Listening()
     for seq in range(1, 30):
-        listening.take(datagram(seq, (seq * 0.1, 0.0, 0.0), session=1))
-        listening.take(datagram(seq, (50.0, 50.0, 0.0), session=2))
+        listening.receive(datagram(seq, (seq * 0.1, 0.0, 0.0), session=1))
+        listening.receive(datagram(seq, (50.0, 50.0, 0.0), session=2))
     assert all(o.y == 0.0 for o in listening.odometry)
     assert listening.port.counts["odometry"].foreign == 29
     assert listening.port.counts["odometry"].restarts == 0
@@ -188,8 +188,8 @@ def test_a_second_sender_and_what_is_no_reading_are_said_once_while_they_last(ca
     def both(seconds: float, wrong: bytes) -> list[str]:
         caplog.clear()
         for _ in range(round(seconds / 0.1)):
-            listening.take(datagram(next(numbers)))
-            listening.take(wrong)
+            listening.receive(datagram(next(numbers)))
+            listening.receive(wrong)
         return [record.message for record in caplog.records]
 
     numbers = count(1)
@@ -200,7 +200,7 @@ def test_a_second_sender_and_what_is_no_reading_are_said_once_while_they_last(ca
     ]
     assert both(3.0, damaged) == ["port 0: what a sender sends is no reading: input datagram: says 60 bytes and has 59"]
     assert both(3.0, rival) == both(3.0, damaged) == []
-    listening.t += CALM_S
+    listening.t += ABSENT_S
     assert len(both(3.0, rival)) == len(both(3.0, damaged)) == 1, "on another day it is news"
 
 
@@ -208,10 +208,10 @@ def test_a_second_sender_and_what_is_no_reading_are_said_once_while_they_last(ca
 def test_continuity_keeps_relative_motion(poses: list[tuple[float, float, float]]) -> None:
     """Restarting between any two poses delivers the same relative motions within each stretch."""
     continuity = Continuity()
-    first = continuity.follow(*poses[0])
+    first = continuity.transform(*poses[0])
     assert first == pytest.approx(poses[0])
     continuity.restart()
-    delivered = [continuity.follow(*pose) for pose in poses[1:]]
+    delivered = [continuity.transform(*pose) for pose in poses[1:]]
     assert delivered[0] == pytest.approx(first, abs=1e-6)
     for (a, b), (c, d) in zip(pairwise(poses[1:]), pairwise(delivered), strict=True):
         assert relative(c, d) == pytest.approx(relative(a, b), abs=1e-5)
@@ -236,7 +236,7 @@ def shared(t: float) -> bytes:
 )
 def test_a_shared_clock_is_believed_within_reason(age: float, believed: bool) -> None:
     listening = Listening()
-    listening.port.take(shared(100.0 - age), 100.0)
+    listening.port.receive(shared(100.0 - age), 100.0)
     (reading,) = listening.odometry
     assert reading.t_mono == pytest.approx(100.0 - age if believed else 100.0)
     assert reading.t_mono <= reading.t_rx == 100.0
@@ -244,7 +244,7 @@ def test_a_shared_clock_is_believed_within_reason(age: float, believed: bool) ->
 
 def test_another_clock_is_not_mixed_with_ours() -> None:
     listening = Listening()
-    listening.take(datagram(1))
+    listening.receive(datagram(1))
     assert listening.odometry[0].t_mono == listening.odometry[0].t_rx == listening.t
 
 

@@ -27,14 +27,14 @@ def itself(t: float) -> float:
 
 
 def told(read: Clock, came: Clock, rate_hz: float = 50.0, seconds: float = 30.0) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) by how much each reading is said to be younger than it is, and when it was true; s.
+    """(n,) by how much each reading is measured to be younger than it is, and when it was true; s.
 
     ``read``: the sender's clock. ``came``: when the one that was true then came, the way of the data not counted.
     """
     clock, true = SenderClock(), np.arange(0.0, seconds, 1.0 / rate_hz)
     arrived = np.maximum.accumulate([came(t) + WAY_S for t in true.tolist()])
-    said = [clock.when(read(t), t_rx) for t, t_rx in zip(true.tolist(), arrived.tolist(), strict=True)]
-    return np.array(said) - true - WAY_S, true
+    measured = [clock.measured_at(read(t), t_rx) for t, t_rx in zip(true.tolist(), arrived.tolist(), strict=True)]
+    return np.array(measured) - true - WAY_S, true
 
 
 def stall(seconds: float, since: float = 10.0) -> Clock:
@@ -120,8 +120,8 @@ def test_an_arrival_that_was_stamped_too_early_dates_nothing_back_for_long() -> 
     clock, true = SenderClock(), np.arange(0.0, 30.0, 0.02)
     arrived = true + WAY_S
     arrived[600] -= 0.5
-    said = [clock.when(itself(t), t_rx) for t, t_rx in zip(true.tolist(), arrived.tolist(), strict=True)]
-    off = np.array(said) - true - WAY_S
+    measured = [clock.measured_at(itself(t), t_rx) for t, t_rx in zip(true.tolist(), arrived.tolist(), strict=True)]
+    off = np.array(measured) - true - WAY_S
     assert np.sum(off[601:] < -0.001) < 20
     assert off[601:].min() > -0.025
 
@@ -131,38 +131,40 @@ numbers = st.floats(allow_nan=False, allow_infinity=False)
 
 @given(st.lists(st.tuples(numbers | st.floats(0.0, 10.0), st.floats(0.0, 1e6) | st.floats(0.0, 0.1)), max_size=60))
 def test_a_reading_is_never_from_the_future_nor_before_another(came: list[tuple[float, float]]) -> None:
-    clock, t, said = SenderClock(), 0.0, list[float]()
+    clock, t, measured = SenderClock(), 0.0, list[float]()
     for time, after in came:
         t += after
-        said.append(clock.when(time, t))
-        assert t - MAX_AGE_S <= said[-1] <= t
-    assert all(a <= b for a, b in pairwise(said))
+        measured.append(clock.measured_at(time, t))
+        assert t - MAX_AGE_S <= measured[-1] <= t
+    assert all(a <= b for a, b in pairwise(measured))
 
 
 @pytest.mark.parametrize("magic", [ODOMETRY_MAGIC, IMU_MAGIC])
 def test_another_computers_reading_that_comes_late_keeps_its_time(magic: bytes) -> None:
-    heard = Listening()
+    listening = Listening()
 
     def take(seq: int, late: float) -> None:
         values = (0.0, 0.0, 0.0) if magic == ODOMETRY_MAGIC else (0.0,)
-        heard.port.take(encode(InputDatagram(magic, 1, seq, 0, 5.0 + 0.02 * seq, values)), 100.0 + 0.02 * seq + late)
+        listening.port.receive(
+            encode(InputDatagram(magic, 1, seq, 0, 5.0 + 0.02 * seq, values)), 100.0 + 0.02 * seq + late
+        )
 
     for seq in range(200):
         take(seq, 0.0)
     take(200, 0.07)
-    reading = (heard.odometry or heard.imu)[-1]
+    reading = (listening.odometry or listening.imu)[-1]
     assert reading.t_rx == pytest.approx(104.07)
     assert reading.t_mono == pytest.approx(104.0)
 
 
 def test_a_sender_that_restarts_is_followed_by_its_own_clock() -> None:
     """The second one's clock is 1 s ahead of where the first one's would be: no gap of the network's."""
-    heard = Listening()
+    listening = Listening()
 
     def take(session: int, seq: int, time: float, t_rx: float) -> None:
-        heard.port.take(encode(InputDatagram(ODOMETRY_MAGIC, session, seq, 0, time, (0.0, 0.0, 0.0))), t_rx)
+        listening.port.receive(encode(InputDatagram(ODOMETRY_MAGIC, session, seq, 0, time, (0.0, 0.0, 0.0))), t_rx)
 
     for seq in range(100):
         take(1, seq, 0.02 * seq, 0.02 * seq)
     take(2, 0, 2.5, 4.0)
-    assert heard.odometry[-1].t_mono == 4.0
+    assert listening.odometry[-1].t_mono == 4.0

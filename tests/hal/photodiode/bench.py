@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from hal.adc import Blemish, RawSamples
 from hal.bus.i2c import BusOpener
+from hal.bus.opening import open_bus
 from hal.clock import Clock, LoopClock, SystemClock, run_virtual
 from hal.errors import HalError
 from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.i2c_adapters import BCM2835, Adapter
-from hal.fake.schedule import FaultSchedule
+from hal.fake.faults.schedule import FaultSchedule
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
-from hal.port.opening import open_bus
 
 BUS = "/dev/i2c-7"  # a name only; nothing is opened under it
 Array = npt.NDArray[np.float64]

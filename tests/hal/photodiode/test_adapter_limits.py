@@ -12,13 +12,13 @@ from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceRefused
 from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.i2c_adapters import BCM2835, CH341, CP2112, DESIGNWARE, FT260, MCP2221, Adapter
-from hal.fake.schedule import FaultSchedule
-from hal.photodiode.adapter_limits import Capability, measure
+from hal.fake.faults.schedule import FaultSchedule
+from hal.photodiode.adapter_limits import AdapterLimits, measure
 from tests.hal.photodiode.bench import Light
 
 
-def measured(adapter: Adapter, block_s: float = 0.05, fault: str = "") -> tuple[Capability, FakeAdc]:
-    async def main() -> tuple[Capability, FakeAdc]:
+def measured(adapter: Adapter, block_s: float = 0.05, fault: str = "") -> tuple[AdapterLimits, FakeAdc]:
+    async def main() -> tuple[AdapterLimits, FakeAdc]:
         clock = LoopClock(asyncio.get_running_loop())
         fake = FakeAdc(Light(), clock, adapter=adapter)
         buses = FakeBuses(clock)
@@ -66,7 +66,7 @@ def test_a_pause_is_found_without_knowing_the_name() -> None:
 
 def test_a_short_time_out_is_found() -> None:
     """The old bcm2708 driver gave up after 150 ms: 1.5 kB at 100 kHz."""
-    found, fake = measured(Adapter("old", scl_hz=100e3, timeout_s=0.15, lame_after_timeout=True), 0.3)
+    found, fake = measured(Adapter("old", scl_hz=100e3, timeout_s=0.15, fails_after_timeout=True), 0.3)
     assert found.length == 512
     assert found.limit == "2048 bytes: Connection timed out"
     assert not fake.bus.gone()

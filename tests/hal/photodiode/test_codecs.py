@@ -71,29 +71,29 @@ def block(words: list[int]) -> bytes:
 def test_a_long_run_of_one_word_is_stuck(run: int, stuck: bool, at: int) -> None:
     words = [2000 + k % 7 for k in range(500)]
     words[at : at + run] = [1234] * run
-    _, blemish, census = inspect(block(words[: at + run + 50]), 2 * len(words[: at + run + 50]), 0xF000, 12)
-    assert (Blemish.STUCK in blemish) == census.stuck == stuck
+    _, blemish, defects = inspect(block(words[: at + run + 50]), 2 * len(words[: at + run + 50]), 0xF000, 12)
+    assert (Blemish.STUCK in blemish) == defects.stuck == stuck
 
 
 def test_a_long_run_at_a_rail_is_clipped_not_stuck() -> None:
     words = [2000 + k % 7 for k in range(500)]
     words[100:300] = [4095] * 200
-    _, blemish, census = inspect(block(words), 1000, 0xF000, 12)
+    _, blemish, defects = inspect(block(words), 1000, 0xF000, 12)
     assert blemish == Blemish.CLIPPED
-    assert census.clipped == pytest.approx(0.4)
-    assert not census.constant
+    assert defects.clipped == pytest.approx(0.4)
+    assert not defects.constant
 
 
 def test_a_whole_block_at_a_rail_is_constant() -> None:
-    _, blemish, census = inspect(bytes(1000), 1000, 0xF000, 12)
+    _, blemish, defects = inspect(bytes(1000), 1000, 0xF000, 12)
     assert blemish == Blemish.CLIPPED
-    assert census.constant
-    assert not census.floated
+    assert defects.constant
+    assert not defects.floated
 
 
 def test_census_counts_words_with_bits_too_many() -> None:
-    _, _, census = inspect(block([0x1800, 0x0800, 0x0801, 0x0802]), 8, 0xF000, 12)
-    assert census.misaligned == 0.25
+    _, _, defects = inspect(block([0x1800, 0x0800, 0x0801, 0x0802]), 8, 0xF000, 12)
+    assert defects.misaligned == 0.25
 
 
 @pytest.mark.parametrize("name", ["mcp3221", "MCP3221", "Adc121c021", "adc121C027"])
@@ -109,7 +109,7 @@ def test_chips_by_name(name: str) -> None:
 )
 def test_mcp3221_has_no_registers(answer: bytes | None, wrong: bool) -> None:
     assert [(query.select, query.length) for query in MCP.queries] == [(b"\x01", 2)]
-    assert bool(MCP.judge((answer,))) == wrong
+    assert bool(MCP.mismatch((answer,))) == wrong
 
 
 def test_adc121c021_is_asked_and_set_up_by_its_registers() -> None:
@@ -117,8 +117,8 @@ def test_adc121c021_is_asked_and_set_up_by_its_registers() -> None:
     asked = [(query.select, query.length) for query in chip.queries]
     assert asked == [(b"\x02", 1), (b"\x03", 2), (b"\x04", 2), (b"\x05", 2)]
     assert chip.setup == (b"\x02\x00", b"\x00")  # automatic conversion and alerts off; pointer at the result
-    assert chip.judge((b"\x00", b"\x00\x00", b"\x0f\xff", b"\x00\x00")) == ""
-    assert chip.judge((b"\xe1", b"\x01\x00", b"\x0a\xbc", b"\x00\x10")) == ""  # as another program has left it
+    assert chip.mismatch((b"\x00", b"\x00\x00", b"\x0f\xff", b"\x00\x00")) == ""
+    assert chip.mismatch((b"\xe1", b"\x01\x00", b"\x0a\xbc", b"\x00\x10")) == ""  # as another program has left it
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_adc121c021_is_asked_and_set_up_by_its_registers() -> None:
     ],
 )
 def test_what_is_no_adc121c021(answers: tuple[bytes | None, ...], says: str) -> None:
-    assert re.search(says, adc121c021.judge(answers))
+    assert re.search(says, adc121c021.mismatch(answers))
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_ads1x15_result(data: str, fraction: float) -> None:
     ],
 )
 def test_ads1x15_is_known_by_its_thresholds(answers: tuple[bytes | None, ...], right: bool) -> None:
-    assert (ads1x15.judge(answers) == "") == right
+    assert (ads1x15.mismatch(answers) == "") == right
 
 
 @pytest.mark.parametrize("chip", [MCP, adc121c021.ADC121C021, adc121c021.ADC121C027], ids=lambda chip: chip.name)
@@ -201,8 +201,8 @@ def test_words_are_right_aligned_unsigned() -> None:
 def test_noise_alone_is_quiet(sigma: float, mean: float, quiet: bool) -> None:
     """A real converter in the dark does not repeat one word, and an amplifier at a rail is not dark."""
     words = np.round(mean + sigma * np.random.default_rng(1).standard_normal(1111)).astype(">u2")
-    _, blemish, census = inspect(words.tobytes(), words.nbytes, MCP.spare, MCP.bits)
-    assert census.quiet is quiet
+    _, blemish, defects = inspect(words.tobytes(), words.nbytes, MCP.spare, MCP.bits)
+    assert defects.quiet is quiet
     assert (Blemish.CLIPPED in blemish) == (mean < 32)
     assert (Blemish.STUCK in blemish) == (sigma == 0.0)
 

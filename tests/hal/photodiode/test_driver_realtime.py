@@ -11,11 +11,11 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from hal.adc import Blemish
+from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import DeviceFault, DeviceRefused
 from hal.fake.adc.converter import FakeAdc
-from hal.port.opening import open_bus
-from tests.hal.i2c_kernel import Kernel
+from tests.hal.bus.i2c_kernel import Kernel
 from tests.hal.photodiode.bench import Bench, Light, error_of, falsehoods
 
 pytestmark = pytest.mark.realtime

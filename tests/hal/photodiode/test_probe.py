@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 import hal.bus.i2c_linux
+from hal.bus.opening import open_bus
 from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused
 from hal.fake.adc.chips import Adc121c021, Eeprom24c02, Lm75, Mcp3221
 from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.i2c_adapters import BCM2835, DESIGNWARE, FT260, Adapter
-from hal.fake.schedule import FaultSchedule
+from hal.fake.faults.schedule import FaultSchedule
 from hal.photodiode.probe import ADDRESSES, BusFinding, probe_buses
-from hal.port.opening import open_bus
-from tests.hal.i2c_kernel import kernel
+from tests.hal.bus.i2c_kernel import kernel
 from tests.hal.photodiode.bench import Light
 
 

@@ -14,15 +14,15 @@ from taps.fleet.robot import Robot
 
 def test_who_has_gone_is_forgotten() -> None:
     claim = Claim(cast(zenoh.Session, None), "agv", "here", lambda mine: None, lambda text: None)
-    claim._heard("gone before the list has come", False)
+    claim._on_claim("gone before the list has come", False)
     assert claim._others, "or the list would bring it back"
     claim._instance = "5"
     for k in range(1000):
-        claim._heard(f"6-{k}", True)
-        claim._heard(f"6-{k}", False)
-    claim._heard("4", True)
+        claim._on_claim(f"6-{k}", True)
+        claim._on_claim(f"6-{k}", False)
+    claim._on_claim("4", True)
     assert claim._before() == "4"
-    claim._heard("4", False)
+    claim._on_claim("4", False)
     assert claim._before() == ""
     assert len(claim._others) <= 1
 

@@ -16,27 +16,28 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 
 from daemon.cli import parser
+from daemon.publish.stream.client import Stream
+from daemon.system import console
 from taps import zenoh_session
 from taps.fleet import messages, robot, show
 from taps.fleet.claim import SURE_S, Claim
-from taps.fleet.messages import LoopTold, StateTold
-from taps.fleet.robot import tell
+from taps.fleet.messages import LoopMessage, StateMessage
+from taps.fleet.robot import join
 from taps.fleet.roster import MOST_ROBOTS, Roster
-from taps.stream.client import Stream
-from taps.zenoh_session import config, joined
+from taps.zenoh_session import open_session, session_config
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
 from tests.taps.serving import served
 
 
 def speaking(made: Router, path: Path, name: str) -> Any:
-    return tell(told_to(made, name), Stream(path, robot.WANTED))
+    return join(told_to(made, name), Stream(path, robot.WANTED))
 
 
 def looking(made: Router, roster: Roster) -> Any:
     async def look() -> None:
-        async with joined(made.address) as session:
-            listener = show.Listener(session, roster)
-            await show.watched(session, made.address, listener.on_router)
+        async with open_session(made.address) as session:
+            listener = show.Collector(session, roster)
+            await show.watch_router(session, made.address, listener.on_router)
 
     return look()
 
@@ -56,7 +57,7 @@ def test_who_comes_late_sees_everything_at_once(tmp_path: Path) -> None:
         assert member.place == (1.0, 2.0, 3.0)
         assert member.state is not None
         assert (member.state.state_name, member.state.up, member.state.map_id) == ("TRACKING", True, 0xABCD)
-        assert len(member.speakers) == 1
+        assert len(member.publishers) == 1
         first = member.pose
         await until(lambda: member.pose is not first and member.state.faults)
         assert roster.problems() == []
@@ -67,7 +68,7 @@ def test_who_comes_late_sees_everything_at_once(tmp_path: Path) -> None:
 
 
 def test_other_programs_ask_with_zenoh_alone(tmp_path: Path) -> None:
-    with served(tmp_path / "s"), router() as made, zenoh.open(config("client", made.address)) as session:
+    with served(tmp_path / "s"), router() as made, zenoh.open(session_config("client", made.address)) as session:
 
         def ask() -> dict[str, Any]:
             found = session.get("lumiloop/*/pose", timeout=1.0)
@@ -89,7 +90,7 @@ def test_a_name_that_is_taken_is_said_and_the_first_robot_does_not_suffer(
 
     async def body(made: Router) -> None:
         await until(lambda: "agv" in roster.members and roster.members["agv"].pose)
-        first = roster.members["agv"].speakers.copy()
+        first = roster.members["agv"].publishers.copy()
         # the second one stands elsewhere: were it heard, the place would jump
         other = asyncio.ensure_future(speaking(made, tmp_path / "other", "agv"))
         await until(lambda: heard("the fleet has a robot agv already"))
@@ -98,7 +99,7 @@ def test_a_name_that_is_taken_is_said_and_the_first_robot_does_not_suffer(
         for _ in range(20):
             await asyncio.sleep(0.05)
             assert roster.members["agv"].place == (1.0, 2.0, 3.0)
-        assert roster.members["agv"].speakers == first
+        assert roster.members["agv"].publishers == first
         other.cancel()
         await asyncio.gather(other, return_exceptions=True)
         await until(lambda: not roster.problems())
@@ -111,7 +112,7 @@ def test_a_name_that_is_taken_is_said_and_the_first_robot_does_not_suffer(
         made.end()
         await asyncio.sleep(1.0)
         made.begin()
-        await until(lambda: roster.members["agv"].speakers and roster.members["agv"].waiting)
+        await until(lambda: roster.members["agv"].publishers and roster.members["agv"].waiting)
         for _ in range(40):
             await asyncio.sleep(0.05)
             assert roster.members["agv"].place == (1.0, 2.0, 3.0)
@@ -148,7 +149,7 @@ def test_of_two_that_have_spoken_the_first_keeps_the_name(
     async def body(made: Router) -> None:
         await until(lambda: "agv" in roster.members and roster.members["agv"].localised)
         await until(lambda: heard("agv is in the fleet"))
-        with zenoh.open(config("client", made.address)) as session:
+        with zenoh.open(session_config("client", made.address)) as session:
             token = session.liveliness().declare_token(messages.alive("agv", messages.instance_of("zz", "cart", 5)))
             await until(lambda: heard("the fleet has a robot agv already, on cart"))
             await asyncio.sleep(0.2)
@@ -168,17 +169,17 @@ def test_who_leaves_while_the_name_is_asked_for_does_not_keep_it(monkeypatch: py
     mine: list[bool] = []
 
     async def body(made: Router) -> None:
-        async with joined(made.address) as session, joined(made.address) as other:
+        async with open_session(made.address) as session, open_session(made.address) as other:
             token = other.liveliness().declare_token(messages.alive("agv", messages.instance_of("zz", "cart", 5)))
             await asyncio.sleep(0.2)
 
-            async def listed(*asked: Any) -> list[str]:
-                found = await zenoh_session.listed(*asked)
+            async def list_tokens(*asked: Any) -> list[str]:
+                found = await zenoh_session.list_tokens(*asked)
                 token.undeclare()
                 await asyncio.sleep(0.3)
                 return found
 
-            monkeypatch.setattr("taps.fleet.claim.listed", listed)
+            monkeypatch.setattr("taps.fleet.claim.list_tokens", list_tokens)
             await beside(until(lambda: mine[-1:] == [True], 5.0), Claim(session, "agv", "here", mine.append).run())
 
     with router() as made:
@@ -191,13 +192,13 @@ def test_only_who_is_in_the_fleet_is_said_to_be(monkeypatch: pytest.MonkeyPatch)
     mine: list[bool] = []
     said: list[str] = []
 
-    async def listed(*asked: Any) -> list[str]:
+    async def list_tokens(*asked: Any) -> list[str]:
         return []
 
-    monkeypatch.setattr("taps.fleet.claim.listed", listed)
+    monkeypatch.setattr("taps.fleet.claim.list_tokens", list_tokens)
 
     async def body(made: Router) -> None:
-        async with joined(made.address) as session, joined(made.address) as other:
+        async with open_session(made.address) as session, open_session(made.address) as other:
             token = other.liveliness().declare_token(messages.alive("agv", messages.instance_of("zz", "cart", 5)))
             await asyncio.sleep(0.2)
 
@@ -225,7 +226,7 @@ def test_a_router_that_dies_is_said_and_all_go_on_when_it_is_back(
         await until(lambda: "agv" in roster.members and roster.members["agv"].localised)
         member = roster.members["agv"]
         made.end()
-        await until(lambda: not member.speakers)
+        await until(lambda: not member.publishers)
         assert not member.localised
         await until(lambda: heard("has gone; waiting for it", 2))
         old = member.pose
@@ -248,7 +249,7 @@ def test_a_robot_waits_for_a_router_and_a_daemon(tmp_path: Path, capsys: pytest.
         made.begin()
         await until(lambda: "agv" in roster.members and roster.members["agv"].state)
         state = roster.members["agv"].state
-        assert isinstance(state, StateTold)
+        assert isinstance(state, StateMessage)
         assert (state.up, state.meaning) == (False, "the daemon does not answer")
         with served(tmp_path / "s"):
             await until(lambda: roster.members["agv"].localised)
@@ -273,7 +274,7 @@ def test_a_router_that_takes_the_connection_and_says_nothing_is_said_and_holds_u
         await until(lambda: heard("no Zenoh router answers"))
 
     async def join(address: str) -> None:
-        async with joined(address):
+        async with open_session(address):
             pytest.fail("there is none")
 
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -292,7 +293,7 @@ def in_a_loop_of_its_own(words: list[str]) -> int:
 def test_the_command_shows_all_robots_on_one_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     async def body(made: Router, words: list[str]) -> None:
         await asyncio.sleep(1.0)
-        assert await asyncio.to_thread(in_a_loop_of_its_own, ["fleet", "--router", made.address, *words]) == parser.OK
+        assert await asyncio.to_thread(in_a_loop_of_its_own, ["fleet", "--router", made.address, *words]) == console.OK
 
     picture = tmp_path / "fleet.png"
     with served(tmp_path / "s"), served(tmp_path / "t", place=(3.0, -4.0, 1.0)), router() as made:
@@ -315,7 +316,7 @@ def test_the_command_shows_all_robots_on_one_map(tmp_path: Path, capsys: pytest.
             assert any("2" in line and "#" in line for line in drawn)
             assert said == f"{picture}: agv2 red"  # agv1 is beyond the tile that there is
             assert picture.read_bytes()[:4] == b"\x89PNG"
-        assert parser.main(["fleet", "--router", made.address]) == parser.FAILED
+        assert parser.main(["fleet", "--router", made.address]) == console.FAILED
         assert "no robot tells anything" in capsys.readouterr().err
 
 
@@ -328,7 +329,7 @@ def test_whoever_makes_up_names_and_messages_does_not_fill_the_viewer(
 
     async def body(made: Router) -> None:
         await until(lambda: "agv" in roster.members and roster.members["agv"].localised)
-        async with joined(made.address) as session:
+        async with open_session(made.address) as session:
             tokens = []
             for number in range(600):
                 tokens.append(session.liveliness().declare_token(messages.alive(f"forged{number}", "1.z.h")))
@@ -341,10 +342,10 @@ def test_whoever_makes_up_names_and_messages_does_not_fill_the_viewer(
             assert roster.members["agv"].localised
             assert any("more than" in line for line in roster.problems())
             assert len(tokens) == 600
-            assert 1 < max(asking) <= show.ASKED_AT_ONCE + 1
+            assert 1 < max(asking) <= show.MOST_QUERIES + 1
         await until(lambda: not any(one.there for one in roster.members.values() if one.name != "agv"))
         await asyncio.sleep(0.3)
-        roster.forget(time.monotonic(), router=True)
+        roster.drop_absent(time.monotonic(), router=True)
         assert list(roster.members) == ["agv"]
         old = roster.members["agv"].pose
         await until(lambda: roster.members["agv"].pose is not old)
@@ -359,11 +360,11 @@ def test_messages_that_wait_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> Non
     roster = Roster()
 
     async def body(made: Router) -> None:
-        async with joined(made.address) as session:
+        async with open_session(made.address) as session:
             await until(lambda: session.info.routers_zid())
-            listener = show.Listener(session, roster)
+            listener = show.Collector(session, roster)
             await asyncio.sleep(0.3)
-            with zenoh.open(config("client", made.address)) as other:
+            with zenoh.open(session_config("client", made.address)) as other:
                 for number in range(20):
                     other.put(messages.key(f"agv{number}", "state"), bytes(20_000))
                 time.sleep(1.0)  # noqa: ASYNC251  the loop stands
@@ -381,12 +382,12 @@ def test_who_asks_once_does_not_wait_for_ever(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("taps.fleet.show.ROUTER_S", 0.3)
-    assert parser.main(["fleet", "--json", "--router", "tcp/127.0.0.1:1"]) == parser.FAILED
+    assert parser.main(["fleet", "--json", "--router", "tcp/127.0.0.1:1"]) == console.FAILED
     told = capsys.readouterr()
     assert told.out == ""
     assert "no router answers at tcp/127.0.0.1:1 within 0.3 s: start one (`lumiloop fleet router`)" in told.err
 
 
 def test_what_is_new_in_a_message_is_skipped() -> None:
-    told = messages.read(b'{"t_utc": 1, "counter": 3, "at_new": [1, 2, 3], "new": 1}', LoopTold)
+    told = messages.read(b'{"t_utc": 1, "counter": 3, "at_new": [1, 2, 3], "new": 1}', LoopMessage)
     assert (told.counter, told.at_new, told.at_old) == (3, (1, 2, 3), None)

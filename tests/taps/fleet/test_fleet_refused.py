@@ -11,7 +11,8 @@ import pytest
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 
 from daemon.cli import parser
-from taps.zenoh_session import BadEndpoint, config
+from daemon.system import console
+from taps.zenoh_session import BadEndpoint, session_config
 from tests.taps.routers import router
 
 
@@ -38,8 +39,8 @@ def test_what_cannot_be_is_said(
     try:
         code = parser.main(words)
     except KeyboardInterrupt:
-        code = parser.INTERRUPTED
-    assert code != parser.OK
+        code = console.INTERRUPTED
+    assert code != console.OK
     assert said in capsys.readouterr().err
 
 
@@ -66,7 +67,7 @@ def test_a_certificate_that_is_none_is_said_and_not_waited_for(tmp_path: Path, c
     if content is not None:
         pem.write_text(content)
     with pytest.raises(BadEndpoint, match=said):
-        config("client", "tls/localhost:1", file)
+        session_config("client", "tls/localhost:1", file)
 
 
 async def interrupted(seconds: float) -> None:
@@ -75,5 +76,5 @@ async def interrupted(seconds: float) -> None:
 
 def test_a_port_that_is_taken_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     with router() as made:
-        assert parser.main(["fleet", "router", "--listen", made.address]) == parser.FAILED
+        assert parser.main(["fleet", "router", "--listen", made.address]) == console.FAILED
     assert f"cannot listen on {made.address}" in capsys.readouterr().err

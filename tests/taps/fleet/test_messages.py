@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from daemon.publish.stream.messages import Fault, Pose, Trust
 from taps.fleet import drawing, messages
-from taps.fleet.messages import Held, MapHead, PoseTold, StateTold, Unreadable
+from taps.fleet.messages import Held, MapHead, PoseMessage, StateMessage, Unreadable
 from taps.fleet.roster import Roster
 from taps.metrics.vda5050 import position_v2
-from taps.stream.messages import Fault, Pose, Trust
 from taps.stream.tiles import FREE, UNSEEN, WALL
 
 POSE = Pose(
@@ -34,7 +34,7 @@ def cells() -> messages.Cells:
 
 def pose_at(x: float, y: float, map_id: str = "000000ab", initialised: bool = True) -> bytes:
     at = {"x": x, "y": y, "theta": 0.0, "mapId": map_id, "positionInitialized": initialised, "deviationRange": 0.25}
-    return messages.encode(PoseTold(seq=1, t_utc=1.7e9, agvPosition=at))
+    return messages.encode(PoseMessage(seq=1, t_utc=1.7e9, agvPosition=at))
 
 
 def test_the_position_object_has_the_standards_names_and_ranges() -> None:
@@ -54,21 +54,21 @@ def test_the_position_object_has_the_standards_names_and_ranges() -> None:
 
 
 def test_a_pose_in_json_is_what_the_standard_has() -> None:
-    told = json.loads(messages.encode(PoseTold(seq=1, t_utc=1.7e9, agvPosition=position_v2(POSE))))
+    told = json.loads(messages.encode(PoseMessage(seq=1, t_utc=1.7e9, agvPosition=position_v2(POSE))))
     assert told["agvPosition"]["x"] == 1.0
     assert told["schema"] == 1
-    assert messages.read(messages.encode(PoseTold(seq=1, t_utc=1.0)), PoseTold).agvPosition is None
+    assert messages.read(messages.encode(PoseMessage(seq=1, t_utc=1.0)), PoseMessage).agvPosition is None
 
 
 def test_a_map_comes_back() -> None:
-    head, made = messages.read_map(*messages.map_told(HEAD, cells()))
+    head, made = messages.read_map(*messages.map_message(HEAD, cells()))
     assert head == HEAD
     assert np.array_equal(made, cells())
 
 
 @given(st.integers(0, 500), st.binary(min_size=1, max_size=4))
 def test_a_damaged_map_is_refused_or_another_map(at: int, damage: bytes) -> None:
-    content, attachment = messages.map_told(HEAD, cells())
+    content, attachment = messages.map_message(HEAD, cells())
     at %= len(content)
     spoilt = content[:at] + damage + content[at + len(damage) :]
     try:
@@ -91,16 +91,16 @@ def test_a_damaged_map_is_refused_or_another_map(at: int, damage: bytes) -> None
 )
 def test_what_is_no_map_is_refused(attachment: bytes, words: str) -> None:
     with pytest.raises(Unreadable, match=words):
-        messages.read_map(messages.map_told(HEAD, cells())[0], attachment)
+        messages.read_map(messages.map_message(HEAD, cells())[0], attachment)
 
 
 def test_one_robot_that_tells_rubbish_does_not_hide_the_others() -> None:
     roster = Roster()
     for robot, content in (("agv1", pose_at(1.0, 1.0)), ("agv2", b"\xff{"), ("agv3", b'{"seq": 1, "t_utc": 0}')):
         roster.token(messages.alive(robot, "1.z.h"), True)
-        roster.take(messages.key(robot, "pose"), content, b"", 5.0)
-    roster.take("lumiloop/agv4/else", b"", b"", 5.0)
-    roster.take("other/agv4/pose", b"", b"", 5.0)
+        roster.receive(messages.key(robot, "pose"), content, b"", 5.0)
+    roster.receive("lumiloop/agv4/else", b"", b"", 5.0)
+    roster.receive("other/agv4/pose", b"", b"", 5.0)
     assert list(roster.members) == ["agv1", "agv2", "agv3"]
     assert [one.localised for one in roster.sorted()] == [True, False, False]
     (problem,) = roster.problems()
@@ -112,16 +112,16 @@ def test_one_robot_that_tells_rubbish_does_not_hide_the_others() -> None:
 def test_a_place_that_is_none_is_shown_as_none(x: str) -> None:
     roster = Roster()
     content = b'{"seq": 1, "t_utc": 0, "agvPosition": {"x": %s, "y": 0, "theta": 0, "mapId": 3}}' % x.encode()
-    roster.take(messages.key("agv1", "pose"), content, b"", 1.0)
+    roster.receive(messages.key("agv1", "pose"), content, b"", 1.0)
     assert roster.members["agv1"].place is None
     assert drawing.table(roster.sorted(), 1.0)[1].split()[:4] == ["1", "agv1", "GONE", "-"]
 
 
 def test_what_others_tell_does_not_reach_the_terminal_as_orders() -> None:
     roster = Roster()
-    state = StateTold(t_utc=1.0, state_name="\x1b[2J", meaning="line\nline \x07\u202e", faults=())
-    roster.take("lumiloop/agv\x1b]0;x/state", messages.encode(state), b"", 1.0)
-    roster.take("lumiloop/agv\x1b]0;x/pose", b"\x1b", b"", 1.0)
+    state = StateMessage(t_utc=1.0, state_name="\x1b[2J", meaning="line\nline \x07\u202e", faults=())
+    roster.receive("lumiloop/agv\x1b]0;x/state", messages.encode(state), b"", 1.0)
+    roster.receive("lumiloop/agv\x1b]0;x/pose", b"\x1b", b"", 1.0)
     lines = [*drawing.table(roster.sorted(), 1.0), *roster.problems()]
     assert len(lines) == 3
     assert all(line.isprintable() for line in lines)
@@ -132,10 +132,10 @@ def test_who_is_there_twice_and_who_is_behind_is_said() -> None:
     assert roster.token(messages.alive("agv1", messages.instance_of("z1", "cart 7", 5)), True) == "agv1"
     assert roster.token(messages.waiting("agv1", messages.instance_of("z2", "cart9", 6)), True) == ""
     for robot, version in (("agv1", 6), ("agv2", 7)):
-        state = StateTold(
+        state = StateMessage(
             t_utc=1.0, held={"survey": Held(version, "aa")}, faults=(Fault(fault=104, meaning="no scan"),)
         )
-        roster.take(messages.key(robot, "state"), messages.encode(state), b"", 1.0)
+        roster.receive(messages.key(robot, "state"), messages.encode(state), b"", 1.0)
     twice, behind = roster.problems()
     assert twice.startswith("agv1: 2 robots have this name, on cart-7, cart9")
     assert behind.startswith("agv1: not the newest survey, 7")
@@ -146,12 +146,12 @@ def test_who_is_there_twice_and_who_is_behind_is_said() -> None:
 
 def test_robots_stand_on_the_map_where_they_are() -> None:
     roster = Roster()
-    roster.take(messages.key("agv1", "map"), *messages.map_told(HEAD, cells()), 1.0)
+    roster.receive(messages.key("agv1", "map"), *messages.map_message(HEAD, cells()), 1.0)
     places = {"agv1": (0.25, 0.25), "agv2": (2.25, 1.25), "elsewhere": (0.25, 0.25), "outside": (50.0, 1.0)}
     for robot, (x, y) in places.items():
         content = pose_at(x, y, "00000001" if robot == "elsewhere" else "000000ab", initialised=robot != "agv2")
         roster.token(messages.alive(robot, "1.z.h"), True)
-        roster.take(messages.key(robot, "pose"), content, b"", 1.0)
+        roster.receive(messages.key(robot, "pose"), content, b"", 1.0)
     chart = roster.chart()
     assert chart is not None
     found = {

@@ -24,9 +24,9 @@ import pytest
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 
 from daemon.publish.modbus.holding import Outcome, Request
-from tests.daemon import mapmaker
-from tests.daemon.mapmaker import Shape
 from tests.daemon.publish.network import publishing
+from tests.daemon.support import map_maker
+from tests.daemon.support.map_maker import Shape
 from tests.taps.routers import free_port
 from tests.taps.serving import served
 from tests.taps.test_docs import commands
@@ -165,7 +165,7 @@ def test_the_commands_of_the_documents(tmp_path: Path) -> None:
     """In their order, against a router of their own: what ends by itself ends well, the rest runs until it is told."""
     address, lasting = f"127.0.0.1:{free_port()}", []
     shutil.copy(ROOT / "systemd/lights/room-of-16.toml", tmp_path / "lights.toml")
-    (tmp_path / "hall.lumimap").write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    (tmp_path / "hall.lumimap").write_bytes(map_maker.content(Shape(map_id=0x77)))
     (tmp_path / "run" / "lumiloop").mkdir(parents=True)
     environment = {"XDG_STATE_HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path / "run"), "PYTHONPATH": str(ROOT)}
     with ExitStack() as stack:
@@ -197,7 +197,7 @@ def test_the_commands_of_the_documents(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("ip") is None, reason="needs root and iproute2")
 def test_five_robots_a_lossy_line_a_partition_and_a_dead_router(tmp_path: Path) -> None:
     shared = tmp_path / "hall.lumimap"
-    shared.write_bytes(mapmaker.content(Shape(submaps=60, frames=12, beams=1081, map_id=0x77)))
+    shared.write_bytes(map_maker.content(Shape(submaps=60, frames=12, beams=1081, map_id=0x77)))
     router = ("fleet", "router", "--listen", ROUTER)
     with ExitStack() as stack:
         network = Network(tmp_path, stack)

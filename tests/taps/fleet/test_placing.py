@@ -14,9 +14,9 @@ from daemon.maps.store import Store
 from estimator.cdma.air_interface import PROFILES
 from estimator.light_filter.survey import Lamp, Receiver, Survey
 from taps.fleet.messages import Held
-from taps.fleet.placing import MAP, RECORD, SURVEY, Offer, Records, Refused, check, chosen, offer_of, place
-from tests.daemon import mapmaker
-from tests.daemon.mapmaker import Shape
+from taps.fleet.placing import MAP, RECORD, SURVEY, Offer, Records, Refused, check, install, newest_offer, offer_of
+from tests.daemon.support import map_maker
+from tests.daemon.support.map_maker import Shape
 
 LAMPS = tuple(Lamp(k + 1, k % 5, 2.0 * k, 1.0, 2.8) for k in range(4))
 SHARED = Survey(LAMPS, Receiver(x=0.5))
@@ -32,7 +32,7 @@ def survey(tmp_path: Path) -> Path:
 @pytest.fixture
 def shared_map(tmp_path: Path) -> Path:
     path = tmp_path / "hall.lumimap"
-    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    path.write_bytes(map_maker.content(Shape(map_id=0x77)))
     return path
 
 
@@ -43,11 +43,11 @@ def settings(folder: Path) -> Config:
 def test_a_survey_keeps_the_robots_own_receiver_and_the_file_before(tmp_path: Path, survey: Path) -> None:
     offer, content = offer_of(SURVEY, survey, 3)
     own = tmp_path / "lights.toml"
-    where, note = place(offer, content, settings(tmp_path), None)
+    where, note = install(offer, content, settings(tmp_path), None)
     assert where == own
     assert "its receiver is the shared file's" in note
     own.write_text(dump(Survey(LAMPS[:1], Receiver(x=-0.25))))
-    _, note = place(offer, content, settings(tmp_path), None)
+    _, note = install(offer, content, settings(tmp_path), None)
     assert "this robot's own" in note
     placed = read_survey(own)
     assert placed.lamps == LAMPS
@@ -62,7 +62,7 @@ def test_a_later_fetch_leaves_alone_what_an_earlier_one_has_put_aside(tmp_path: 
     versions = [dump(Survey(LAMPS[:1], Receiver(x=x))) for x in (-0.25, -0.5)]
     for text, aside in ((versions[0], ""), (versions[1], "2"), (versions[1], "2"), (versions[0], "")):
         own.write_text(text)
-        _, note = place(offer, content, settings(tmp_path), None)
+        _, note = install(offer, content, settings(tmp_path), None)
         assert f"the old file is lights.toml.before{aside}" in note
     assert [(tmp_path / f"lights.toml.before{number}").read_text() for number in ("", "2")] == versions
 
@@ -74,18 +74,18 @@ def test_a_survey_is_read_for_the_air_interface_that_this_robot_has(tmp_path: Pa
     offer, content = offer_of(SURVEY, path, 1)
     given = msgspec.structs.replace(settings(tmp_path), photodiode=PhotodiodeConfig(profile="B"))
     assert PROFILES["B"].depth != PROFILES["A"].depth
-    place(offer, content, given, None)
+    install(offer, content, given, None)
     assert read_survey(tmp_path / "lights.toml").depth == PROFILES["B"].depth
     path.write_text("lamp = [{ lamp_id = 1, code = 500, x = 0.0, y = 0.0, z = 3.0 }]")
     with pytest.raises(Refused, match="code 500 is none of profile"):
-        place(*offer_of(SURVEY, path, 2), settings(tmp_path), None)
+        install(*offer_of(SURVEY, path, 2), settings(tmp_path), None)
 
 
 def test_a_survey_needs_a_place(tmp_path: Path, survey: Path) -> None:
     offer, content = offer_of(SURVEY, survey, 3)
     with pytest.raises(Refused, match=r"set `lights\.survey`, or name a file with --survey FILE"):
-        place(offer, content, Config(), None)
-    assert place(offer, content, Config(), tmp_path / "elsewhere.toml")[0].exists()
+        install(offer, content, Config(), None)
+    assert install(offer, content, Config(), tmp_path / "elsewhere.toml")[0].exists()
 
 
 def test_a_disk_that_is_full_leaves_the_survey_as_it_was(
@@ -101,7 +101,7 @@ def test_a_disk_that_is_full_leaves_the_survey_as_it_was(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(Refused, match="No space left"):
-        place(offer, content, settings(tmp_path), None)
+        install(offer, content, settings(tmp_path), None)
     assert own.read_bytes() == before
     assert {path.name for path in tmp_path.iterdir()} == {"shared.toml", "lights.toml"}
 
@@ -112,17 +112,17 @@ def test_a_survey_that_cannot_be_checked_for_a_full_disk_is_refused(
     offer, content = offer_of(SURVEY, survey, 3)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
     with pytest.raises(Refused, match=r"shared\.toml: cannot be checked, for want of a temporary file: No such file"):
-        place(offer, content, settings(tmp_path), None)
+        install(offer, content, settings(tmp_path), None)
 
 
 def test_a_map_is_what_the_next_start_takes(tmp_path: Path, shared_map: Path) -> None:
     given = settings(tmp_path)
     maps = Path(given.map.folder)
     maps.mkdir()
-    (maps / "map-00001234-00000004.lumimap").write_bytes(mapmaker.content(Shape()))
+    (maps / "map-00001234-00000004.lumimap").write_bytes(map_maker.content(Shape()))
     offer, content = offer_of(MAP, shared_map, 1)
     assert offer.map_id == 0x77
-    where, _ = place(offer, content, given, None)
+    where, _ = install(offer, content, given, None)
     assert where.name == "map-00000077-00000005.lumimap"
     start = Store(maps).load()
     assert start is not None
@@ -134,17 +134,17 @@ def test_beside_a_running_daemon_another_map_is_put_and_its_own_is_not_touched(
 ) -> None:
     given = settings(tmp_path)
     daemon = Store(Path(given.map.folder))
-    daemon.save(mapmaker.content(Shape()), 0x1234)  # which takes the folder
+    daemon.save(map_maker.content(Shape()), 0x1234)  # which takes the folder
     offer, content = offer_of(MAP, shared_map, 1)
     try:
-        where, note = place(offer, content, given, None)
+        where, note = install(offer, content, given, None)
         assert where.name == "map-00000077-00000002.lumimap"
         assert "--switch" in note
         assert daemon.load_map(0x77).stored.meta.map_id == 0x77
-        daemon.save(mapmaker.content(Shape(submaps=5)), 0x1234)
+        daemon.save(map_maker.content(Shape(submaps=5)), 0x1234)
         assert where.exists()
         with pytest.raises(Refused, match="a running daemon keeps map 00000077 there itself; stop it"):
-            place(offer, content, given, None)
+            install(offer, content, given, None)
     finally:
         daemon.close()
 
@@ -157,7 +157,7 @@ def test_what_is_damaged_on_the_way_is_refused_and_nothing_changes(
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     for spoilt in (content[:-1], content + b"\0", b"", content[:50] + b"\xff" + content[51:]):
         with pytest.raises(Refused, match=f"{kind} .* version 1: what came .* is not what was announced"):
-            place(offer, spoilt, settings(tmp_path), None)
+            install(offer, spoilt, settings(tmp_path), None)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -172,7 +172,7 @@ def test_what_is_no_survey_or_another_map_than_announced_is_refused(tmp_path: Pa
         offer_of(MAP, tmp_path / "none", 1)
     offer, content = offer_of(MAP, shared_map, 1)
     with pytest.raises(Refused, match="holds map 00000077, not 00000001 as announced"):
-        place(msgspec.structs.replace(offer, map_id=1), content, settings(tmp_path), None)
+        install(msgspec.structs.replace(offer, map_id=1), content, settings(tmp_path), None)
     assert not (tmp_path / "maps").exists()
 
 
@@ -191,14 +191,14 @@ OFFER = Offer(kind=SURVEY, name="lights.toml", version=7, sha256="aa", size=1)
 )
 def test_what_is_older_or_contradicts_itself_is_refused(offers: list[Offer], held: Held | None, words: str) -> None:
     with pytest.raises(Refused, match=words):
-        chosen(SURVEY, offers, held)
+        newest_offer(SURVEY, offers, held)
 
 
 def test_the_newest_is_taken_once() -> None:
     older = msgspec.structs.replace(OFFER, version=6, sha256="bb")
-    assert chosen(SURVEY, [older, OFFER], None) == OFFER
-    assert chosen(SURVEY, [older, OFFER, OFFER], Held(6, "bb")) == OFFER
-    assert chosen(SURVEY, [older, OFFER], Held(7, "aa")) is None
+    assert newest_offer(SURVEY, [older, OFFER], None) == OFFER
+    assert newest_offer(SURVEY, [older, OFFER, OFFER], Held(6, "bb")) == OFFER
+    assert newest_offer(SURVEY, [older, OFFER], Held(7, "aa")) is None
 
 
 def test_what_was_taken_is_noted_and_a_spoilt_note_is_none(tmp_path: Path) -> None:

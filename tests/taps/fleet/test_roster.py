@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from taps.fleet import drawing, messages, roster
-from taps.fleet.messages import StateTold
+from taps.fleet.messages import StateMessage
 from taps.fleet.roster import GONE_S, MOST_INSTANCES, MOST_ROBOTS, Roster
 from tests.taps.fleet.test_messages import HEAD, cells, pose_at
 
@@ -20,13 +20,13 @@ def there(made: Roster, robot: str, is_there: bool = True) -> str:
 
 
 def tell(made: Roster, robot: str, now: float) -> None:
-    made.take(messages.key(robot, "pose"), pose_at(1.0, 1.0), b"", now)
+    made.receive(messages.key(robot, "pose"), pose_at(1.0, 1.0), b"", now)
 
 
 def noise(side: int) -> tuple[bytes, bytes]:
     """A map that cannot be made smaller, of so many cells a side; larger than it, if anything."""
     head = msgspec.structs.replace(HEAD, columns=side, rows=side)
-    return messages.map_told(head, np.frombuffer(os.urandom(side * side), np.int8).reshape(side, side))
+    return messages.map_message(head, np.frombuffer(os.urandom(side * side), np.int8).reshape(side, side))
 
 
 def test_who_has_been_gone_for_long_leaves() -> None:
@@ -34,11 +34,11 @@ def test_who_has_been_gone_for_long_leaves() -> None:
     for robot in ("gone", "silent"):
         there(made, robot)
         tell(made, robot, 0.0)
-    made.forget(1.0, router=True)
+    made.drop_absent(1.0, router=True)
     there(made, "gone", False)
-    made.forget(GONE_S, router=True)
+    made.drop_absent(GONE_S, router=True)
     assert list(made.members) == ["gone", "silent"]
-    made.forget(GONE_S + 1.5, router=True)
+    made.drop_absent(GONE_S + 1.5, router=True)
     assert list(made.members) == ["silent"]
     tell(made, "gone", GONE_S + 2.0)
     assert list(made.members) == ["silent", "gone"]
@@ -49,8 +49,8 @@ def test_without_a_router_nobody_is_known_to_have_gone() -> None:
     there(made, "agv")
     tell(made, "agv", 0.0)
     made.without_router()
-    made.forget(5.0 * GONE_S, router=False)
-    made.forget(5.0 * GONE_S + 1.0, router=True)
+    made.drop_absent(5.0 * GONE_S, router=False)
+    made.drop_absent(5.0 * GONE_S + 1.0, router=True)
     assert list(made.members) == ["agv"]
 
 
@@ -92,7 +92,7 @@ def test_speakers_that_are_made_up_are_some() -> None:
     for number in range(50 * MOST_INSTANCES):
         made.token(messages.alive("agv", f"{number}.z.h"), True)
         made.token(messages.waiting("agv", f"{number}.z.h"), True)
-    assert len(made.members["agv"].speakers) == len(made.members["agv"].waiting) == MOST_INSTANCES
+    assert len(made.members["agv"].publishers) == len(made.members["agv"].waiting) == MOST_INSTANCES
 
 
 def test_maps_and_words_that_are_made_up_take_no_more_than_there_is_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,28 +101,28 @@ def test_maps_and_words_that_are_made_up_take_no_more_than_there_is_for_all(monk
     made, large = Roster(), noise(500)
     tracemalloc.start()
     try:
-        made.take(messages.key("agv", "map"), *messages.map_told(HEAD, cells()), 1.0)
+        made.receive(messages.key("agv", "map"), *messages.map_message(HEAD, cells()), 1.0)
         for number in range(100):
             for _ in range(2):  # the second in the place of the first
-                made.take(messages.key(f"forged{number}", "map"), bytes(bytearray(large[0])), large[1], 1.0)
+                made.receive(messages.key(f"forged{number}", "map"), bytes(bytearray(large[0])), large[1], 1.0)
         assert sum(len(one.map.content) for one in made.members.values() if one.map) <= most
-        long = messages.encode(StateTold(t_utc=1.0, meaning=1_000_000 * "x"))
+        long = messages.encode(StateMessage(t_utc=1.0, meaning=1_000_000 * "x"))
         for number in range(100):
-            made.take(messages.key(f"forged{number}", "state"), long, b"", 1.0)
+            made.receive(messages.key(f"forged{number}", "state"), long, b"", 1.0)
         kept, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     assert kept < 2 * most
     assert "forged99: state: a message of 1000" in "\n".join(made.problems())
-    made.take(messages.key("forged0", "map"), *messages.map_told(HEAD, cells()), 2.0)
-    made.take(messages.key("forged50", "map"), *large, 2.0)
+    made.receive(messages.key("forged0", "map"), *messages.map_message(HEAD, cells()), 2.0)
+    made.receive(messages.key("forged50", "map"), *large, 2.0)
     assert made.members["forged50"].map is not None  # what another gave back
-    made.take(messages.key("forged60", "map"), *large, 2.0)
+    made.receive(messages.key("forged60", "map"), *large, 2.0)
     assert "forged60: map: no room" in "\n".join(made.problems())
     assert made.members["agv"].map is not None
 
 
 def test_a_cell_of_the_table_has_an_end() -> None:
     made = Roster()
-    made.take(messages.key("agv", "state"), messages.encode(StateTold(t_utc=1.0, meaning=50_000 * "x")), b"", 1.0)
+    made.receive(messages.key("agv", "state"), messages.encode(StateMessage(t_utc=1.0, meaning=50_000 * "x")), b"", 1.0)
     assert max(map(len, drawing.table(made.sorted(), 1.0))) < 500

@@ -19,9 +19,9 @@ from taps.fleet import messages
 from taps.fleet.fetch import Fetcher
 from taps.fleet.placing import MAP, SURVEY, Offer, Records, offer_of
 from taps.fleet.share import key_of, share
-from taps.zenoh_session import config, joined, listed
-from tests.daemon import mapmaker
-from tests.daemon.mapmaker import Shape
+from taps.zenoh_session import list_tokens, open_session, session_config
+from tests.daemon.support import map_maker
+from tests.daemon.support.map_maker import Shape
 from tests.taps.routers import Heard, Router, beside, router, told_to, until
 
 LAMPS = tuple(Lamp(k + 1, k % 5, 2.0 * k, 1.0, 2.8) for k in range(4))
@@ -82,10 +82,10 @@ def test_robots_follow_what_is_shared_and_refuse_what_is_older(
 def test_who_shares_is_there_for_as_long_as_it_does(survey: Path) -> None:
     async def body(made: Router) -> None:
         alive = f"{messages.SHARED}/alive/*"
-        async with joined(made.address) as session:
+        async with open_session(made.address) as session:
             await until(lambda: list(session.get(key_of(SURVEY), timeout=1.0)))  # declared before the token is
             await asyncio.sleep(0.5)
-            assert len(await listed(session, alive)) == 1
+            assert len(await list_tokens(session, alive)) == 1
 
     with router() as made:
         asyncio.run(beside(body(made), sharing(made, survey=survey, version=7)))
@@ -100,7 +100,7 @@ def test_what_comes_damaged_is_refused(tmp_path: Path, survey: Path, capsys: pyt
                 if query.key_expr.intersects(key):
                     query.reply(key, told)
 
-    with router() as made, zenoh.open(config("client", made.address)) as session:
+    with router() as made, zenoh.open(session_config("client", made.address)) as session:
         session.declare_queryable("lumiloop/@shared/**", answer)
         one = fetcher(made, tmp_path)
         asyncio.run(one.run())
@@ -122,7 +122,7 @@ def test_what_the_sender_writes_does_not_reach_the_terminal_as_orders(
                 if query.key_expr.intersects(key):
                     query.reply(key, told)
 
-    with router() as made, zenoh.open(config("client", made.address)) as session:
+    with router() as made, zenoh.open(session_config("client", made.address)) as session:
         session.declare_queryable("lumiloop/@shared/**", answer)
         asyncio.run(fetcher(made, tmp_path).run())
     said = capsys.readouterr().err
@@ -134,7 +134,7 @@ def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "hall.lumimap"
-    path.write_bytes(mapmaker.content(Shape(submaps=60, frames=12, beams=1081, map_id=0x77)))
+    path.write_bytes(map_maker.content(Shape(submaps=60, frames=12, beams=1081, map_id=0x77)))
     assert path.stat().st_size > 1_000_000
     asked: list[tuple[str, str, int, int]] = []
 
@@ -159,7 +159,7 @@ def test_a_switch_that_was_not_done_fails_and_is_asked_for_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "hall.lumimap"
-    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    path.write_bytes(map_maker.content(Shape(map_id=0x77)))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     outcomes = ["refused", "refused", "done"]
 
@@ -183,7 +183,7 @@ def test_what_was_deleted_or_is_wanted_elsewhere_is_fetched_again(
     tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "hall.lumimap"
-    path.write_bytes(mapmaker.content(Shape(map_id=0x77)))
+    path.write_bytes(map_maker.content(Shape(map_id=0x77)))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
     def fetch(made: Router, **more: Any) -> str:
@@ -223,7 +223,7 @@ def test_who_offers_what_is_no_offer_does_not_keep_others_from_being_heard(
         with query:
             query.reply(key_of(SURVEY), offer)
 
-    with router() as made, zenoh.open(config("client", made.address)) as session:
+    with router() as made, zenoh.open(session_config("client", made.address)) as session:
         session.declare_queryable(key_of(SURVEY), answer)
         one = fetcher(made, tmp_path)
 

@@ -22,6 +22,7 @@ from daemon.recording import disk_writer, flight_recorder
 from daemon.recording.retention import DUMP
 from daemon.replay.results import Trajectory, kitti, tum
 from daemon.snapshot import State
+from daemon.system import console
 from daemon.system.versions import build
 from hal.replay.recording import Kind, open_recording
 from hal.replay.report import LogReport
@@ -38,7 +39,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from taps.mcap import export
 from taps.mcap.recover import NotMcap, recover
 from taps.mcap.writer import McapFile
-from taps.ros.messages import TOPICS, Out
+from taps.ros.messages import TOPICS, RosMessage
 
 ROOT = Path(__file__).parents[3]
 MOUNT = (0.1, -0.02, math.radians(30.0))
@@ -50,7 +51,7 @@ def exported(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exported")
     words = ["export", str(recording), "--mcap", str(folder / "drive.mcap"), "--online"]
     words += ["--tum", str(folder / "drive.tum"), "--kitti", str(folder / "drive.kitti")]
-    assert parser.main(words) == parser.OK
+    assert parser.main(words) == console.OK
     return folder
 
 
@@ -180,18 +181,18 @@ def whole_file(path: Path, count: int = 400) -> None:
 def fill(file: McapFile, count: int) -> None:
     noise = np.random.default_rng(1)
     for number in range(count):
-        file.write(Out("/lumiloop/raw", 10**18 + number * 25_000_000, noise.bytes(200)))
+        file.write(RosMessage("/lumiloop/raw", 10**18 + number * 25_000_000, noise.bytes(200)))
 
 
 def test_an_export_of_another_build_s_recording_says_so(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["export", str(recording), "--tum", str(tmp_path / "drive.tum")]
-    assert parser.main(words) == parser.OK
+    assert parser.main(words) == console.OK
     assert "recorded with" not in capsys.readouterr().err
     built = build()
     monkeypatch.setattr("daemon.system.versions.build", lambda: "of today")
-    assert parser.main(words) == parser.OK
+    assert parser.main(words) == console.OK
     said = capsys.readouterr()
     assert f"{recording}: recorded with build {built}; this is build of today: the replay may differ" in said.err
     assert said.out == ""
@@ -201,7 +202,7 @@ def test_an_export_that_is_told_to_stop_leaves_nothing_half_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stopped(args: argparse.Namespace) -> int:
-        with export._beside(args.tum) as part:
+        with export._replaced_on_success(args.tum) as part:
             part.write_bytes(b"half of it")
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(5.0)
@@ -230,9 +231,9 @@ def test_of_a_killed_writer_all_but_the_last_half_second_is_there(
     torn, whole = tmp_path / "torn.mcap", tmp_path / "whole.mcap"
     child = (
         "import os, time\nfrom pathlib import Path\n"
-        "from taps.mcap.writer import McapFile\nfrom taps.ros.messages import Out\n"
+        "from taps.mcap.writer import McapFile\nfrom taps.ros.messages import RosMessage\n"
         f"file = McapFile(Path({str(torn)!r}))\n"
-        "for n in range(400): file.write(Out('/lumiloop/raw', 10**18 + n * 25_000_000, os.urandom(200)))\n"
+        "for n in range(400): file.write(RosMessage('/lumiloop/raw', 10**18 + n * 25_000_000, os.urandom(200)))\n"
         "print('written', flush=True)\ntime.sleep(60)\n"
     )
     with subprocess.Popen([sys.executable, "-c", child], cwd=ROOT, stdout=subprocess.PIPE) as process:
@@ -241,7 +242,7 @@ def test_of_a_killed_writer_all_but_the_last_half_second_is_there(
         os.kill(process.pid, signal.SIGKILL)
     with torn.open("rb") as file, pytest.raises((McapError, ValueError)):
         make_reader(file).get_summary()
-    assert parser.main(["export", str(torn), "--mcap", str(whole)]) == parser.OK
+    assert parser.main(["export", str(torn), "--mcap", str(whole)]) == console.OK
     assert "its writer still writes or was killed" in capsys.readouterr().err
     (told,) = raw_messages(whole)
     assert 400 - 20 <= len(told) <= 400, "half a second at 40 Hz are 20"
@@ -282,8 +283,8 @@ def test_what_is_no_mcap_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[s
     (tmp_path / "a").write_bytes(b"nothing")
     with pytest.raises(NotMcap, match="does not begin as one"):
         recover(tmp_path / "a", tmp_path / "b")
-    assert parser.main(["export", str(tmp_path / "none"), "--mcap", str(tmp_path / "b")]) == parser.FAILED
-    assert parser.main(["export", str(tmp_path / "a")]) == parser.USAGE
+    assert parser.main(["export", str(tmp_path / "none"), "--mcap", str(tmp_path / "b")]) == console.FAILED
+    assert parser.main(["export", str(tmp_path / "a")]) == console.USAGE
     said = capsys.readouterr().err
     assert "say what to write" in said
     assert not (tmp_path / "b").exists()
@@ -295,9 +296,9 @@ def test_an_mcap_file_is_neither_written_over_itself_nor_made_into_a_trajectory(
     file = tmp_path / "drive.mcap"
     file.write_bytes((exported / "drive.mcap").read_bytes())
     before = file.read_bytes()
-    assert parser.main(["export", str(file), "--mcap", str(tmp_path / "x" / ".." / "drive.mcap")]) == parser.USAGE
+    assert parser.main(["export", str(file), "--mcap", str(tmp_path / "x" / ".." / "drive.mcap")]) == console.USAGE
     assert "name another one" in capsys.readouterr().err
-    assert parser.main(["export", str(file), "--tum", str(tmp_path / "t")]) == parser.USAGE
+    assert parser.main(["export", str(file), "--tum", str(tmp_path / "t")]) == console.USAGE
     assert "made of the recording itself" in capsys.readouterr().err
     assert file.read_bytes() == before
 
@@ -312,15 +313,15 @@ def test_an_export_never_writes_over_what_it_reads_nor_over_itself(
     before = segment.read_bytes()
     (tmp_path / "link").symlink_to(segment)
     for log in (segment, segment.parent):
-        assert parser.main(["export", str(log), option, str(tmp_path / "link")]) == parser.USAGE
+        assert parser.main(["export", str(log), option, str(tmp_path / "link")]) == console.USAGE
         said = capsys.readouterr().err
         assert f"{option} {tmp_path / 'link'}: is the file that is read; name another one" in said
     other = "--kitti" if option == "--tum" else "--tum"
-    assert parser.main(["export", str(segment), option, str(tmp_path / "t"), other, f"{tmp_path}/./t"]) == parser.USAGE
+    assert parser.main(["export", str(segment), option, str(tmp_path / "t"), other, f"{tmp_path}/./t"]) == console.USAGE
     assert "writes, too; name another one" in capsys.readouterr().err
     assert segment.read_bytes() == before
     assert not (tmp_path / "t").exists()
-    assert parser.main(["export", str(segment), option, str(tmp_path / "none" / "t")]) == parser.USAGE
+    assert parser.main(["export", str(segment), option, str(tmp_path / "none" / "t")]) == console.USAGE
     assert f"there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
 
 
@@ -331,10 +332,10 @@ def test_an_mcap_file_that_is_there_is_replaced_only_when_asked(
     there = tmp_path / "there.mcap"
     there.write_bytes(b"a day of a robot")
     command = ["export", str(exported / "drive.mcap"), "--mcap", str(there)]
-    assert parser.main(command) == parser.USAGE
+    assert parser.main(command) == console.USAGE
     assert "is there already; name another file, or replace it with --force" in capsys.readouterr().err
     assert there.read_bytes() == b"a day of a robot"
-    assert parser.main([*command, "--force"]) == parser.OK
+    assert parser.main([*command, "--force"]) == console.OK
     assert messages(there)
 
 
@@ -347,7 +348,7 @@ def test_a_dump_of_the_flight_recorder_opens_with_the_poses_that_were_told(
     monkeypatch.setattr(flight_recorder, "LEAST_S", 2.0)
     bench = record(tmp_path / "rec", asked, keep_s=4.0)
     (dump,) = (tmp_path / "rec").glob(f"{DUMP}*-asked")
-    assert parser.main(["export", str(dump), "--mcap", str(tmp_path / "dump.mcap")]) == parser.OK
+    assert parser.main(["export", str(dump), "--mcap", str(tmp_path / "dump.mcap")]) == console.OK
     told = messages(tmp_path / "dump.mcap")
     published = [(1.7e9 + one.t_mono, one.pose) for one in bench.snapshots if one.pose is not None]
     assert len(told["/pose"]) >= 30

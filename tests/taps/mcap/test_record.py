@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from daemon.cli import parser
-from daemon.publish.stream_server import framed
+from daemon.publish.stream.server import framed
+from daemon.system import console
 
 pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
 from mcap.reader import make_reader
@@ -29,7 +30,7 @@ def record(path: Path, out: Path, *words: str) -> int:
 
 def test_all_that_a_daemon_tells_is_in_the_file(tmp_path: Path) -> None:
     with served(tmp_path / "s"):
-        assert record(tmp_path / "s", tmp_path / "a.mcap", "--raw") == parser.OK
+        assert record(tmp_path / "s", tmp_path / "a.mcap", "--raw") == console.OK
     told = messages(tmp_path / "a.mcap")
     assert set(told) == set(TOPICS)
     assert 15 < len(told["/pose"]) < 80
@@ -51,10 +52,10 @@ def test_what_is_there_stays_and_nobody_is_waited_for_in_vain(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "a.mcap").write_bytes(b"precious")
-    assert record(tmp_path / "s", tmp_path / "a.mcap") == parser.USAGE
+    assert record(tmp_path / "s", tmp_path / "a.mcap") == console.USAGE
     assert (tmp_path / "a.mcap").read_bytes() == b"precious"
-    assert record(tmp_path / "s", tmp_path / "b.mcap") == parser.FAILED
-    assert record(tmp_path / "s", tmp_path / "none" / "b.mcap") == parser.USAGE
+    assert record(tmp_path / "s", tmp_path / "b.mcap") == console.FAILED
+    assert record(tmp_path / "s", tmp_path / "none" / "b.mcap") == console.USAGE
     said = capsys.readouterr().err
     assert "replace it with --force" in said
     assert "is the daemon running?" in said
@@ -63,14 +64,14 @@ def test_what_is_there_stays_and_nobody_is_waited_for_in_vain(
 
 def test_nothing_told_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The service keeps so many files: those of hours without a daemon would push out those of its last drives."""
-    assert record(tmp_path / "s", tmp_path / "a.mcap") == parser.FAILED
+    assert record(tmp_path / "s", tmp_path / "a.mcap") == console.FAILED
     with other_version(tmp_path / "t"):
-        assert record(tmp_path / "t", tmp_path / "b.mcap") == parser.FAILED
+        assert record(tmp_path / "t", tmp_path / "b.mcap") == console.FAILED
     said = capsys.readouterr().err
     assert "nothing was told, and no file is left; is the daemon running?" in said
     assert "install both from the same release" in said
     assert not list(tmp_path.glob("*.mcap"))
-    assert record(tmp_path / "s", Path("/dev/null"), "--force") == parser.FAILED
+    assert record(tmp_path / "s", Path("/dev/null"), "--force") == console.FAILED
     assert Path("/dev/null").exists()
 
 
@@ -100,7 +101,7 @@ def test_a_disk_is_not_filled(
     out, room = tmp_path / "a.mcap", iter([300, 300, 300, 300, 199])
     monkeypatch.setattr(writer, "free_bytes", lambda folder: next(room, 199) << 20)
     with served(tmp_path / "s"):
-        assert record(tmp_path / "s", out, "--seconds", "20") == parser.FAILED
+        assert record(tmp_path / "s", out, "--seconds", "20") == console.FAILED
     said = capsys.readouterr().err
     assert f"{out}: stopped, only 199 MB are free there (--reserve keeps 200): " in said
     assert "the file is whole up to here" in said
@@ -115,7 +116,7 @@ def test_without_room_no_file_is_begun(tmp_path: Path, capsys: pytest.CaptureFix
     out = tmp_path / "a.mcap"
     out.write_bytes(b"precious")
     with served(tmp_path / "s"):
-        assert record(tmp_path / "s", out, "--force", "--reserve", "1e9") == parser.FAILED
+        assert record(tmp_path / "s", out, "--force", "--reserve", "1e9") == console.FAILED
     assert "--reserve" in capsys.readouterr().err
     assert out.read_bytes() == b"precious"
 
@@ -123,7 +124,7 @@ def test_without_room_no_file_is_begun(tmp_path: Path, capsys: pytest.CaptureFix
 def test_a_folder_that_is_not_there_is_named_before_any_daemon_is_waited_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert record(tmp_path / "s", tmp_path / "none" / "a.mcap", "--seconds", "2") == parser.USAGE
+    assert record(tmp_path / "s", tmp_path / "none" / "a.mcap", "--seconds", "2") == console.USAGE
     assert f"there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
 
 
@@ -137,5 +138,5 @@ def test_a_time_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_a_disk_that_is_full_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with served(tmp_path / "s"):
-        assert record(tmp_path / "s", Path("/dev/full"), "--force") == parser.FAILED
+        assert record(tmp_path / "s", Path("/dev/full"), "--force") == console.FAILED
     assert "/dev/full: No space left on device; free space" in capsys.readouterr().err

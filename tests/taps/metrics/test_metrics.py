@@ -14,14 +14,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import Fault, Faults, Hello, Pose, Statistics
 from daemon.snapshot import State
+from taps.access_guard import Guard
 from taps.metrics import server
-from taps.metrics.metrics import Told, exposition
+from taps.metrics.metrics import Latest, exposition
 from taps.metrics.server import serve
 from taps.metrics.vda5050 import position, position_v2
-from taps.stream.client import Lost, Stream
-from taps.stream.messages import Fault, Faults, Hello, Pose, Statistics
-from taps.view.access_guard import Guard
 from tests.taps.serving import served
 
 families = pytest.importorskip("prometheus_client.parser").text_string_to_metric_families
@@ -129,11 +129,11 @@ def test_the_address_that_is_printed_is_one(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_daemon_that_has_gone_is_down_and_has_no_pose() -> None:
-    told = Told()
-    told.take(Hello(schema=1, name="agv", pid=1), 0.0)
-    told.take(POSE, 1.0)
+    told = Latest()
+    told.update(Hello(schema=1, name="agv", pid=1), 0.0)
+    told.update(POSE, 1.0)
     assert "lumiloop_pose_age_seconds 1.5" in exposition(told, 2.5)
-    told.take(Lost("gone"), 3.0)
+    told.update(Lost("gone"), 3.0)
     assert (
         exposition(told, 3.0)
         == "# HELP lumiloop_up whether the daemon answers\n# TYPE lumiloop_up gauge\nlumiloop_up 0\n"
@@ -141,30 +141,30 @@ def test_a_daemon_that_has_gone_is_down_and_has_no_pose() -> None:
 
 
 def test_texts_are_escaped() -> None:
-    told = Told(up=True, t_spoke=0.0, faults=Faults(present=(Fault(fault=1, meaning='a "b"\\\n'),)))
+    told = Latest(up=True, t_message=0.0, faults=Faults(present=(Fault(fault=1, meaning='a "b"\\\n'),)))
     (family,) = [one for one in families(exposition(told, 0.0)) if one.name == "lumiloop_fault"]
     assert family.samples[0].labels["meaning"] == 'a "b"\\\n'
 
 
 def test_a_daemon_that_stands_still_is_not_up() -> None:
     """Its connection stays, and nothing comes: what it said last, TRACKING perhaps, is not so any more."""
-    told = Told()
-    told.take(Hello(schema=1, name="agv", pid=1), 0.0)
-    told.take(POSE, 1.0)
+    told = Latest()
+    told.update(Hello(schema=1, name="agv", pid=1), 0.0)
+    told.update(POSE, 1.0)
     assert "lumiloop_up 1" in exposition(told, 4.0)
     assert exposition(told, 4.5).splitlines()[2:] == ["lumiloop_up 0"]
-    told.take(Statistics(t_mono=5.0), 5.0)
+    told.update(Statistics(t_mono=5.0), 5.0)
     assert "lumiloop_up 1" in exposition(told, 5.5)
 
 
 def test_a_daemon_that_stands_still_does_not_localize() -> None:
     """It is connected and says nothing: the kernel has not noticed, and a vehicle must not trust what was."""
-    told = Told()
-    told.take(POSE, time.monotonic())
-    answering = server.Answering(told, Guard(bind="127.0.0.1"))
+    told = Latest()
+    told.update(POSE, time.monotonic())
+    answering = server.HttpHandler(told, Guard(bind="127.0.0.1"))
     request = b"GET /vda5050 HTTP/1.1\r\n\r\n"
     assert b'"localized": true' in answering._answer(request)
-    told.t_heard -= 3.5
+    told.t_pose -= 3.5
     said = answering._answer(request)
     assert b'"localized": false' in said
     assert b'"x": 1.0' in said
@@ -182,7 +182,7 @@ def test_a_daemon_that_stands_still_does_not_localize() -> None:
     ],
 )
 def test_a_page_whose_name_was_turned_to_this_computer_reads_nothing(bind: str, named: bytes, status: bytes) -> None:
-    answering = server.Answering(Told(), Guard(bind=bind))
+    answering = server.HttpHandler(Latest(), Guard(bind=bind))
     said = answering._answer(b"GET /metrics HTTP/1.1\r\n" + named + b"\r\n")
     assert said.split(b" ")[1] == status
     assert (b"under a name that is not its own" in said) == (status == b"403")
@@ -190,22 +190,22 @@ def test_a_page_whose_name_was_turned_to_this_computer_reads_nothing(bind: str, 
 
 def test_of_a_daemon_that_has_gone_the_last_place_is_told_and_of_the_next_one_its_own() -> None:
     """A vehicle that asks for its position learns where it was last known to be, and that this is not known to hold."""
-    told = Told()
-    answering = server.Answering(told, Guard(bind="127.0.0.1"))
+    told = Latest()
+    answering = server.HttpHandler(told, Guard(bind="127.0.0.1"))
     request = b"GET /vda5050/2 HTTP/1.1\r\n\r\n"
-    told.take(Hello(schema=1, name="agv", pid=1), 0.0)
+    told.update(Hello(schema=1, name="agv", pid=1), 0.0)
     assert b"503" in answering._answer(request)
-    told.take(POSE, time.monotonic())
-    told.take(Lost("gone"), time.monotonic())
+    told.update(POSE, time.monotonic())
+    told.update(Lost("gone"), time.monotonic())
     said = answering._answer(request)
     assert b" 200 OK" in said
     assert json.loads(said.partition(b"\r\n\r\n")[2])["agvPosition"] == {
         "x": 1.0, "y": 2.0, "theta": pytest.approx(7.0 - 2.0 * math.pi, abs=1e-5), "mapId": "000000ff",
         "positionInitialized": False, "localizationScore": 0.0,
     }  # fmt: skip
-    told.take(Hello(schema=1, name="agv", pid=2), 9.0)
+    told.update(Hello(schema=1, name="agv", pid=2), 9.0)
     assert b"there is no pose yet" in answering._answer(request)
-    told.take(msgspec.structs.replace(POSE, state=int(State.LOST), pose=None), time.monotonic())
+    told.update(msgspec.structs.replace(POSE, state=int(State.LOST), pose=None), time.monotonic())
     assert b"there is no pose yet" in answering._answer(request)
 
 

@@ -14,11 +14,11 @@ pytest.importorskip("rosbags", reason="pip install 'lumiloop[mcap]'")
 from rosbags.typesys import Stores, get_typestore
 
 from daemon.config.schema import Mount
-from daemon.publish.stream_server import SIDE, scan_message
+from daemon.publish.stream.messages import MapTiles, Pose, Scan
+from daemon.publish.stream.server import SIDE, scan_message
 from daemon.snapshot import State
-from taps.ros.messages import AGAIN_S, Translator
-from taps.stream.messages import MapTiles, Pose, Scan
-from tests.daemon.publish.test_stream_server import GEOMETRY, raw_scan
+from taps.ros.messages import REPEAT_S, Translator
+from tests.daemon.publish.stream.test_server import GEOMETRY, raw_scan
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -33,7 +33,7 @@ def tile(fill: int) -> MapTiles:
 
 
 def told(translator: Translator, topic: str, *frames: Any) -> list[Any]:
-    out = [one for frame in frames for one in translator.take(frame) if one.topic == topic]
+    out = [one for frame in frames for one in translator.convert(frame) if one.topic == topic]
     kind = {
         "/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
         "/map": "nav_msgs/msg/OccupancyGrid",
@@ -47,9 +47,9 @@ def test_a_map_that_was_reset_does_not_stay_latched() -> None:
     translator = Translator(Mount())
     (before,) = told(translator, "/map", tile(20), pose(1.0))
     assert set(before.data) == {100}
-    (after,) = told(translator, "/map", tile(0), pose(2.0), pose(2.0 + AGAIN_S))
+    (after,) = told(translator, "/map", tile(0), pose(2.0), pose(2.0 + REPEAT_S))
     assert (after.info.width, after.info.height, list(after.data)) == (1, 1, [-1])
-    assert not told(translator, "/map", pose(3.0 + 2.0 * AGAIN_S))
+    assert not told(translator, "/map", pose(3.0 + 2.0 * REPEAT_S))
 
 
 def test_beams_without_an_echo_are_infinite_and_those_that_say_nothing_are_no_number() -> None:

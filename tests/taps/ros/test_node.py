@@ -15,10 +15,10 @@ pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
+from daemon.publish.stream.client import Stream
 from taps.ros import node, rmw_zenoh, types
 from taps.ros.messages import TOPICS
-from taps.stream.client import Stream
-from taps.zenoh_session import config
+from taps.zenoh_session import session_config
 from tests.taps.routers import beside, router, told_to, until
 from tests.taps.serving import served
 
@@ -50,7 +50,7 @@ def serve(made: Any, path: Path, namespace: str = "", domain: int = 0) -> Any:
 
 
 def test_what_a_subscriber_of_ros_gets(tmp_path: Path) -> None:
-    with served(tmp_path / "s"), router() as made, zenoh.open(config("client", made.address)) as session:
+    with served(tmp_path / "s"), router() as made, zenoh.open(session_config("client", made.address)) as session:
         pose, scan = (Subscriber(session, topic, "/agv", 7) for topic in ("/pose", "/scan"))
 
         async def body() -> None:
@@ -77,7 +77,7 @@ def test_what_a_subscriber_of_ros_gets(tmp_path: Path) -> None:
 
 def test_the_graph_that_ros2_topic_list_is_made_of(tmp_path: Path) -> None:
     found: list[str] = []
-    with served(tmp_path / "s"), router() as made, zenoh.open(config("client", made.address)) as session:
+    with served(tmp_path / "s"), router() as made, zenoh.open(session_config("client", made.address)) as session:
 
         def graph() -> list[str]:
             return [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/0/**", timeout=1.0)]
@@ -104,7 +104,7 @@ def test_who_comes_late_gets_what_stands_still_also_after_the_router_was_gone(
     """The mount is told every 5 s, the state at a change: both come at once, and the pose goes on."""
 
     async def late(made: Any) -> None:
-        with zenoh.open(config("client", made.address)) as session:
+        with zenoh.open(session_config("client", made.address)) as session:
             kept = [Subscriber(session, topic) for topic in ("/tf_static", "/lumiloop/state", "/map")]
             pose = Subscriber(session, "/pose")
             await until(lambda: all(one.got for one in kept) and pose.got, 4.0)
@@ -125,7 +125,7 @@ def test_who_comes_late_gets_what_stands_still_also_after_the_router_was_gone(
 
 
 def test_a_second_node_of_the_name_is_refused_and_the_first_does_not_suffer(tmp_path: Path) -> None:
-    with served(tmp_path / "s"), router() as made, zenoh.open(config("client", made.address)) as session:
+    with served(tmp_path / "s"), router() as made, zenoh.open(session_config("client", made.address)) as session:
         pose = Subscriber(session, "/pose")
 
         async def body() -> None:
@@ -140,13 +140,13 @@ def test_a_second_node_of_the_name_is_refused_and_the_first_does_not_suffer(tmp_
 
 
 def test_of_two_that_join_at_once_or_meet_again_one_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both have waited for the router, and neither finds the other in the list: no topic may have two speakers."""
+    """Both have waited for the router, and neither finds the other in the list: no topic may have two publishers."""
 
     async def nobody(session: Any, key: str) -> list[str]:
         return []
 
-    monkeypatch.setattr(node, "listed", nobody)
-    with served(tmp_path / "s"), router() as made, zenoh.open(config("client", made.address)) as session:
+    monkeypatch.setattr(node, "list_tokens", nobody)
+    with served(tmp_path / "s"), router() as made, zenoh.open(session_config("client", made.address)) as session:
         pose = Subscriber(session, "/pose")
 
         async def both() -> None:

@@ -15,25 +15,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.config.paths import stream_path
-from daemon.publish.stream_server import SCHEMA, TOPICS, StreamServer, framed
+from daemon.publish.stream import client, messages
+from daemon.publish.stream.client import Lost, Stream
+from daemon.publish.stream.messages import TYPES, Frame, Hello, NotTheStream
+from daemon.publish.stream.server import SCHEMA, TOPICS, StreamServer, framed
 from daemon.snapshot import (
     Condition,
+    CycleTiming,
     LightFix,
     LightLink,
     LightPicture,
     LinkUse,
     Part,
-    Pulse,
     Snapshot,
     State,
     Thread,
     Trust,
 )
 from hal.adc import Blemish, RawSamples
-from taps.stream import client, messages
-from taps.stream.client import Lost, Stream
-from taps.stream.messages import TYPES, Frame, Hello, NotTheStream
-from tests.daemon.publish.test_stream_server import raw_scan, run
+from tests.daemon.publish.stream.test_server import raw_scan, run
 from tests.taps.serving import served
 
 LINK = LightLink(5, 12, LinkUse.ACCEPTED, 1e-6, 0.01)
@@ -49,7 +49,7 @@ FULL = Snapshot(
     light=LightPicture(LightFix.GOOD, 1, 0.9, links=(LINK,)),
     loop_counter=1,
     trust=Trust(horizontal_m=0.1, laser=True),
-    pulse=Pulse(cycle=(1, 2, 3), stages=((1, 2, 3), None)),
+    pulse=CycleTiming(cycle=(1, 2, 3), stages=((1, 2, 3), None)),
     condition=Condition(5, (104,), down=frozenset({Part.LIDAR}), hanging=frozenset({Thread.MAP})),
 )
 

@@ -11,8 +11,8 @@ from daemon.config.schema import Config
 from daemon.health.assessment import REPLAYED
 from daemon.health.faults import FAULTS, Fault
 from daemon.integrity.lamp_monitor import LASTS_S
-from taps.stream.messages import Faults
-from taps.stream.recording_source import Retold
+from daemon.publish.stream.messages import Faults
+from taps.stream.recording_source import RecordingSource
 from tests.daemon.replay.test_recorded_lights import Recorded, record
 from tests.daemon.replay.test_recorded_run import pulled
 from tests.daemon.replay.test_recorded_run import record as record_run
@@ -43,7 +43,7 @@ def dark(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, set[int]]:
 
 def test_an_export_tells_them(dark: tuple[Path, set[int]]) -> None:
     recording, live = dark
-    told = [frame for frame in Retold(recording, Config()).frames(raw=False) if isinstance(frame, Faults)]
+    told = [frame for frame in RecordingSource(recording, Config()).frames(raw=False) if isinstance(frame, Faults)]
     assert {one.fault for frame in told for one in frame.present} == live
     (came, *_) = (frame for frame in told if any(one.fault == Fault.NO_LAMPS for one in frame.present))
     (fault,) = (one for one in came.present if one.fault == Fault.NO_LAMPS)
@@ -53,15 +53,15 @@ def test_an_export_tells_them(dark: tuple[Path, set[int]]) -> None:
 
 
 def test_a_film_shows_them_when_they_were(dark: tuple[Path, set[int]], tmp_path: Path) -> None:
-    from taps.view.replay_file import Film
+    from taps.view.replay_file import ReplayFile
     from taps.view.replay_recorder import make
 
     recording, live = dark
     make(recording, Config(), (False, ()), tmp_path / "film")
-    film = Film(recording, tmp_path / "film")
-    film.look()
+    film = ReplayFile(recording, tmp_path / "film")
+    film.refresh()
     assert (film.done, film.error) == (True, "")
-    reel = film.reels["faults"]
+    reel = film.tracks["faults"]
     told = [msgspec.msgpack.decode(film.piece(reel, index))["data"]["present"] for index in range(len(reel.times))]
     assert {one["fault"] for present in told for one in present} == live
     came = next(t for t, present in zip(reel.times, told, strict=True) if any(one["fault"] == 171 for one in present))
@@ -72,7 +72,9 @@ def test_a_film_shows_them_when_they_were(dark: tuple[Path, set[int]], tmp_path:
 def test_what_devices_said_is_told_as_it_was_published(tmp_path: Path) -> None:
     """A replay has no devices."""
     record_run(tmp_path / "rec", pulled)
-    told = [frame for frame in Retold(tmp_path / "rec", Config()).frames(raw=False) if isinstance(frame, Faults)]
+    told = [
+        frame for frame in RecordingSource(tmp_path / "rec", Config()).frames(raw=False) if isinstance(frame, Faults)
+    ]
     assert [any(one.fault == Fault.LIDAR_MISSING for one in frame.present) for frame in told] == [True, False]
     came, gone = (frame.t_mono for frame in told)
     assert came is not None

@@ -13,14 +13,14 @@ from typing import Any
 import msgspec
 from aiohttp import ClientSession, ClientWebSocketResponse, web
 
-from daemon.publish.stream_server import StreamServer
-from daemon.snapshot import LightFix, LightLink, LightPicture, LinkUse, Pulse, Snapshot, State, Trust
-from taps.stream.client import Stream
-from taps.view.access_guard import Guard
+from daemon.publish.stream.client import Stream
+from daemon.publish.stream.server import StreamServer
+from daemon.snapshot import CycleTiming, LightFix, LightLink, LightPicture, LinkUse, Snapshot, State, Trust
+from taps.access_guard import Guard
 from taps.view.page_hello import Scene
-from taps.view.replay_file import Film
+from taps.view.replay_file import ReplayFile
 from taps.view.server import TOPICS, View
-from tests.daemon.publish.test_stream_server import until
+from tests.daemon.publish.stream.test_server import until
 
 TOKEN = "a-token-of-more-than-sixteen-letters"
 PATIENCE_S = 5.0
@@ -36,7 +36,7 @@ def snapshot(seq: int, **other: Any) -> Snapshot:
     told: dict[str, Any] = {
         "pose": (0.01 * seq, 0.0, 0.1), "covariance": (1e-4, 0.0, 4e-4, 0.0, 0.0, 1e-4), "map_id": 7, "light": LIGHT,
         "links": 2, "cycle_us": 1500, "trust": Trust(horizontal_m=0.1, gap=1.0), "velocity": (0.4, 0.0, 0.0),
-        "pulse": Pulse(cycle=(1500, 2500, 4000), late=(100, 300, 900), stages=((100, 200, 300), None)),
+        "pulse": CycleTiming(cycle=(1500, 2500, 4000), late=(100, 300, 900), stages=((100, 200, 300), None)),
         "scan_rate": 40.0, "known": (True, True, True), "lidar_ok": True, **other,
     }  # fmt: skip
     return Snapshot(seq, t, t + 0.002, 1.7e9 + t + 0.002, told.pop("state", State.TRACKING), 0, **told)
@@ -95,7 +95,7 @@ class Page:
 async def serving(
     folder: Path,
     guard: Guard | None = None,
-    film: Film | None = None,
+    film: ReplayFile | None = None,
     modbus: int = 0,
     scene: Scene | None = None,
     again: Callable[[], Scene] | None = None,

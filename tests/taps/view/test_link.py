@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from taps.stream.messages import MapTiles
+from daemon.publish.stream.messages import MapTiles
+from taps.access_guard import Guard
 from taps.view import server
-from taps.view.access_guard import Guard
 from tests.taps.view.house import TOKEN, House, serving, snapshot
 from tools.docs.browser import CHROMIUM, Tab, chromium, tab
 
@@ -132,7 +132,7 @@ def test_a_browser_that_cannot_draw_the_map_says_so(browser: str, tmp_path: Path
                 map_id=7, resolution=0.05, side=128, unit=0.1, version=1, more=False,
                 tiles=((0, 0, zlib.compress(bytes([20]) * 128 * 128)),),
             )  # fmt: skip
-            house.view.hub.take(tiles)
+            house.view.hub.distribute(tiles)
             house.stream.publish(snapshot(1))
             await page.until(f"{POSE} === 1")
             assert page.said == []

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from daemon.config.paths import stream_path
-from taps.view.access_guard import Guard
-from taps.view.orders import OrderRefused, switch_map
+from taps.access_guard import Guard
+from taps.command_client import CommandRefused, switch_map
 from tests.taps.view.house import TOKEN, serving
 
 OTHER = """
@@ -63,7 +63,7 @@ def test_nor_is_its_map_switched(
         path = stream_path("agv")
         server = await asyncio.start_unix_server(lambda reader, writer: writer.close(), path)
         try:
-            with pytest.raises(OrderRefused, match="not by the daemon that is meant"):
+            with pytest.raises(CommandRefused, match="not by the daemon that is meant"):
                 await switch_map("agv", "127.0.0.1", other[0], 1)
         finally:
             server.close()

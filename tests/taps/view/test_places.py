@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from taps.access_guard import Guard
 from taps.view import server
-from taps.view.access_guard import Guard
 from tests.taps.view.house import TOKEN, House, snapshot
 from tests.taps.view.test_server import run
 
 
 def test_who_says_nothing_takes_no_viewer_s_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as there are places, and more, open a socket and say nothing; one with the token comes all the same."""
-    monkeypatch.setattr(server, "STRANGERS", 3)
+    monkeypatch.setattr(server, "UNAUTHENTICATED", 3)
     monkeypatch.setattr(server, "VIEWERS", 4)
 
     async def body(house: House) -> None:
@@ -53,7 +53,7 @@ def test_what_cannot_be_sent_ends_that_connection_aloud(
             await other.welcome()
             (first, _) = sorted(house.view.hub.viewers, key=lambda viewer: viewer.number)
             await page.until("daemon")
-            monkeypatch.setattr(first, "take", lambda: 1 / 0)
+            monkeypatch.setattr(first, "next_message", lambda: 1 / 0)
             house.stream.publish(snapshot(1))
             while await page.read():
                 pass

@@ -13,8 +13,8 @@ import pytest
 
 from daemon.config.schema import Config
 from taps.view import command
-from taps.view.replay_file import HEAD, KINDS, Film
-from taps.view.replay_player import Player
+from taps.view.replay_file import HEAD, KINDS, ReplayFile
+from taps.view.replay_player import ReplayPlayer
 from taps.view.replay_recorder import STEP_S, make
 from taps.view.viewers import Viewer, encode, frame
 from tests.taps.view.house import serving
@@ -33,7 +33,7 @@ def tile(t: float, column: int, cells: bytes) -> tuple[float, str, bytes]:
 
 def told(viewer: Viewer) -> list[tuple[str, Any]]:
     found: list[tuple[str, Any]] = []
-    while (message := viewer.take()) is not None:
+    while (message := viewer.next_message()) is not None:
         for one in msgspec.msgpack.decode(message):
             several = one["data"] if one["topic"] == "many" else [one]
             found += [(each["topic"], each["data"]) for each in several]
@@ -41,7 +41,7 @@ def told(viewer: Viewer) -> list[tuple[str, Any]]:
 
 
 @pytest.fixture
-def film(tmp_path: Path) -> Film:
+def film(tmp_path: Path) -> ReplayFile:
     """Poses each second from 10 to 20, a loop at 15, a tile that is drawn at 12 and again at 18, another at 16."""
     file = tmp_path / "film"
     file.touch()
@@ -50,15 +50,15 @@ def film(tmp_path: Path) -> Film:
         write(file, *([tile(t, 0, b"a")] if t == 12 else [tile(t, 0, b"b")] if t == 18 else []))
         write(file, *([tile(t, 1, b"c")] if t == 16 else []))
         write(file, *([(t, "loop", frame("loop", {"counter": 1}))] if t == 15 else []))
-    return Film(tmp_path, file)
+    return ReplayFile(tmp_path, file)
 
 
-def test_any_instant_is_shown_as_if_one_had_watched_until_then(film: Film) -> None:
+def test_any_instant_is_shown_as_if_one_had_watched_until_then(film: ReplayFile) -> None:
     async def body() -> None:
-        film.look()
+        film.refresh()
         assert (film.t_first, film.t_last, film.done) == (10.0, 20.0, False)
         viewer = Viewer(1)
-        player = Player(film, viewer)
+        player = ReplayPlayer(film, viewer)
         player.seek(16.5)
         seen = told(viewer)
         assert [data for topic, data in seen if topic == "pose"] == [{"t_mono": 16}]
@@ -72,14 +72,14 @@ def test_any_instant_is_shown_as_if_one_had_watched_until_then(film: Film) -> No
         assert not [data for topic, data in seen if topic in ("loop", "loops")]
         assert seen[-1][1]["tiles"] == [[1, 0, b""]]
         player.speed = 4.0
-        player.go_on(1.5)
+        player.advance(1.5)
         seen = told(viewer)
         assert player.at == 18.5
         assert [data for topic, data in seen if topic == "pose"] == [{"t_mono": 18}]
         assert [data for topic, data in seen if topic == "row"] == [[t] for t in range(13, 19)]
         assert ("loop", {"counter": 1}) in seen  # it is played
         assert sorted(seen[-1][1]["tiles"]) == [[0, 0, b"b"], [1, 0, b"c"]]
-        player.go_on(60.0)
+        player.advance(60.0)
         assert player.at == 20.0
         film.close()
 
@@ -89,12 +89,12 @@ def test_any_instant_is_shown_as_if_one_had_watched_until_then(film: Film) -> No
 def test_a_bar_that_is_dragged_before_there_is_a_pose_blanks_nothing(tmp_path: Path) -> None:
     file = tmp_path / "film"
     file.touch()
-    film = Film(tmp_path, file)
+    film = ReplayFile(tmp_path, file)
 
     async def body() -> None:
         viewer = Viewer(1)
-        player = Player(film, viewer)
-        player.told({"at": 0.0, "speed": 2.0})
+        player = ReplayPlayer(film, viewer)
+        player.control({"at": 0.0, "speed": 2.0})
         playing = asyncio.create_task(player.run())
         write(file, *((t, "pose", frame("pose", {"t_mono": t})) for t in (10, 11)))
         for _ in range(100):
@@ -109,11 +109,11 @@ def test_a_bar_that_is_dragged_before_there_is_a_pose_blanks_nothing(tmp_path: P
     asyncio.run(body())
 
 
-def test_tiles_on_their_way_when_the_time_leaps_are_told_again(film: Film) -> None:
+def test_tiles_on_their_way_when_the_time_leaps_are_told_again(film: ReplayFile) -> None:
     async def body() -> None:
-        film.look()
+        film.refresh()
         viewer = Viewer(1)
-        player = Player(film, viewer)
+        player = ReplayPlayer(film, viewer)
         player.seek(16.5)
         player.seek(17.0)  # the bar is dragged: nothing of the first instant has reached the browser
         assert sorted(told(viewer)[-1][1]["tiles"]) == [[0, 0, b"a"], [1, 0, b"c"]]
@@ -124,32 +124,32 @@ def test_tiles_on_their_way_when_the_time_leaps_are_told_again(film: Film) -> No
     asyncio.run(body())
 
 
-def test_a_film_that_is_still_being_made(film: Film, tmp_path: Path) -> None:
-    film.look()
+def test_a_film_that_is_still_being_made(film: ReplayFile, tmp_path: Path) -> None:
+    film.refresh()
     file = tmp_path / "film"
     body = frame("pose", {"t_mono": 21})
     with file.open("ab") as out:
         out.write(HEAD.pack(21.0, KINDS.index("pose"), len(body)) + body[:3])
-    film.look()
+    film.refresh()
     assert film.t_last == 20.0  # half a piece
     with file.open("ab") as out:
         out.write(body[3:])
     write(file, (0.0, "end", b"the recording is torn"))
-    film.look()
+    film.refresh()
     assert (film.t_last, film.done, film.error) == (21.0, True, "the recording is torn")
     film.close()
 
 
-def test_a_film_whose_maker_has_died_says_so(film: Film, tmp_path: Path) -> None:
+def test_a_film_whose_maker_has_died_says_so(film: ReplayFile, tmp_path: Path) -> None:
     """Killed, or without room on the disk: it cannot write that it has ended, and looked as if it would go on."""
     alive = True
-    watched = Film(Path("log"), tmp_path / "film", lambda: alive)
-    watched.look()
+    watched = ReplayFile(Path("log"), tmp_path / "film", lambda: alive)
+    watched.refresh()
     assert (watched.done, watched.t_last) == (False, 20.0)
     with (tmp_path / "film").open("ab") as out:
         out.write(HEAD.pack(21.0, KINDS.index("pose"), 500) + b"half of it")
     alive = False
-    watched.look()
+    watched.refresh()
     assert (watched.done, watched.t_last) == (True, 20.0)
     assert "died before its end" in watched.error
     watched.close()
@@ -157,7 +157,7 @@ def test_a_film_whose_maker_has_died_says_so(film: Film, tmp_path: Path) -> None
 
 
 def test_a_disk_that_is_full_is_named(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command._shoot(recording, Config(), (False, ()), Path("/dev/full"))
+    command._record(recording, Config(), (False, ()), Path("/dev/full"))
     said = capsys.readouterr().err
     assert "/dev/full: No space left on device; the recording is shown as far" in said
 
@@ -170,14 +170,14 @@ def test_a_recording_that_ends_early_does_not_look_whole() -> None:
 
 
 @pytest.mark.parametrize("words", [None, 7, [], {"at": "x"}, {"speed": float("inf")}, {"paused": 1}, {"at": True}])
-def test_a_page_that_talks_nonsense(film: Film, words: object) -> None:
+def test_a_page_that_talks_nonsense(film: ReplayFile, words: object) -> None:
     async def body() -> None:
-        film.look()
-        player = Player(film, Viewer(1))
+        film.refresh()
+        player = ReplayPlayer(film, Viewer(1))
         player.seek(15.0)
-        player.told(words)
+        player.control(words)
         assert (player.at, player.speed, player.paused) == (15.0, 1.0, False)
-        player.told({"at": -1e300, "speed": 1e300})
+        player.control({"at": -1e300, "speed": 1e300})
         assert (player.at, player.speed) == (10.0, 60.0)
         film.close()
 
@@ -187,11 +187,11 @@ def test_a_page_that_talks_nonsense(film: Film, words: object) -> None:
 def test_a_recording_is_shown_from_its_beginning_and_takes_no_orders(recording: Path, tmp_path: Path) -> None:
     file = tmp_path / "film"
     make(recording, Config(), (False, ()), file)
-    film = Film(recording, file)
-    film.look()
+    film = ReplayFile(recording, file)
+    film.refresh()
     assert (film.done, film.error) == (True, "")
     assert film.t_last - film.t_first > 7.0
-    times = list(film.reels["pose"].times)
+    times = list(film.tracks["pose"].times)
     assert min(after - before for before, after in itertools.pairwise(times)) > STEP_S / 2
     assert film.scene is not None
     assert film.tiles
@@ -218,8 +218,8 @@ def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
     log, file = tmp_path / "log.clf", tmp_path / "film"
     log.write_text("nothing of use\n")
     make(log, Config(), (False, ()), file)
-    film = Film(log, file)
-    film.look()
+    film = ReplayFile(log, file)
+    film.refresh()
     assert film.done
     assert "log.clf" in film.error
     film.close()

@@ -11,7 +11,7 @@ import pytest
 from daemon.config.survey_loader import write_survey
 from estimator.light_filter.survey import Lamp, Survey
 from taps.view.command import _scene
-from taps.view.page_hello import CannotLook, Scene
+from taps.view.page_hello import Scene, SceneUnreadable
 from tests.taps.view.house import House, serving
 from tools.docs.browser import CHROMIUM, chromium, tab
 
@@ -25,10 +25,10 @@ def begins_anew(house: House) -> None:
 
 
 def test_a_daemon_that_begins_with_another_survey(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    found: list[Scene | CannotLook] = [BEFORE]
+    found: list[Scene | SceneUnreadable] = [BEFORE]
 
     def again() -> Scene:
-        if isinstance(found[-1], CannotLook):
+        if isinstance(found[-1], SceneUnreadable):
             raise found[-1]
         return found[-1]
 
@@ -42,7 +42,7 @@ def test_a_daemon_that_begins_with_another_survey(tmp_path: Path, caplog: pytest
             assert (told["lamps"], told["mount"]) == ([[1, 5, 3.0, 4.0]], [0.1, 0.0, 90.0, False])
             async with house.page() as other:
                 assert (await other.welcome())["lamps"] == [[1, 5, 3.0, 4.0]]
-            found.append(CannotLook("lights.toml, line 3: lamp 7 twice"))
+            found.append(SceneUnreadable("lights.toml, line 3: lamp 7 twice"))
             begins_anew(house)
             await page.until("daemon", lambda told: told["up"])
             async with house.page() as other:
@@ -62,10 +62,10 @@ def test_what_is_read_is_the_files_as_they_are_now(tmp_path: Path) -> None:
     again = _scene(file, ("lidar.mount.yaw=90.0",))
     assert (again.lamps, again.mount[0], again.mount[2]) == ([(7, 3, 5.0, 2.0)], 0.2, 90.0)
     lights.write_text("garbage")
-    with pytest.raises(CannotLook, match=r"lights\.toml"):
+    with pytest.raises(SceneUnreadable, match=r"lights\.toml"):
         _scene(file, ())
     file.write_text("nonsense = 1\n")
-    with pytest.raises(CannotLook, match="nonsense"):
+    with pytest.raises(SceneUnreadable, match="nonsense"):
         _scene(file, ())
 
 

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from aiohttp import WSServerHandshakeError
 
-from daemon.publish import stream_server as daemon_stream
+from daemon.publish.stream import server as daemon_stream
+from daemon.publish.stream.messages import Loop, MapTiles, Scan
 from daemon.snapshot import State
-from taps.stream.messages import Loop, MapTiles, Scan
+from taps.access_guard import Guard
 from taps.view import server, viewers
-from taps.view.access_guard import Guard
-from tests.daemon.publish.test_stream_server import raw_scan, until
+from tests.daemon.publish.stream.test_server import raw_scan, until
 from tests.taps.view.house import TOKEN, House, serving, snapshot
 
 
@@ -192,7 +192,7 @@ def test_a_page_that_is_closed_while_it_is_greeted_is_no_error(
         return greet(*told)
 
     async def body(house: House) -> None:
-        monkeypatch.setattr(server, "_little_kept", requests.append)
+        monkeypatch.setattr(server, "_limit_buffers", requests.append)
         monkeypatch.setattr(server, "welcome", closed)
         async with house.page() as page:
             while await page.read():
@@ -213,7 +213,7 @@ def test_a_browser_that_takes_nothing_gets_the_latest() -> None:
             viewer.put("pose", viewers.frame("pose", number))
             viewer.put("loop", viewers.frame("loop", number), once=True)
             viewer.put_tiles({"side": 2}, [((0, 0), bytes([number])), ((number % 3, 1), bytes(40_000))])
-        message = viewer.take()
+        message = viewer.next_message()
         assert message is not None
         told = msgspec.msgpack.decode(message)
         loops = [one["data"] for one in told if one["topic"] == "loop"]
@@ -221,11 +221,11 @@ def test_a_browser_that_takes_nothing_gets_the_latest() -> None:
         assert [one["data"] for one in told if one["topic"] == "pose"] == [99]
         tiles = [one for one in told if one["topic"] == "map"]
         assert tiles[0]["data"]["tiles"][0] == [0, 0, bytes([99])]
-        assert viewer.some.is_set()  # there are more tiles than fit into one message
-        rest = viewer.take()
+        assert viewer.pending.is_set()  # there are more tiles than fit into one message
+        rest = viewer.next_message()
         assert rest is not None
         assert len(msgspec.msgpack.decode(rest)[0]["data"]["tiles"]) == 1
-        assert viewer.take() is None
+        assert viewer.next_message() is None
         assert viewer.replaced == 99 + 100 - viewers.KEPT
 
     asyncio.run(body())
@@ -245,9 +245,9 @@ def test_little_that_is_old_is_on_its_way_to_a_slow_browser(tmp_path: Path, monk
         writer.write(b"\x81\x82\0\0\0\0{}")  # its first words, masked with nothing
         await reader.readuntil(b"welcome")
         for _ in range(300):  # 12 MB
-            house.view.hub.take(told)
+            house.view.hub.distribute(told)
             await asyncio.sleep(0.002)
-        house.view.hub.tell("row", "the end")
+        house.view.hub.broadcast("row", "the end")
         came = 0
         while b"the end" not in (data := await asyncio.wait_for(reader.read(1 << 16), 5.0)):
             came += len(data)
@@ -280,7 +280,7 @@ def test_a_newcomer_gets_every_tile(tmp_path: Path) -> None:
         hub = house.view.hub
         about = {"map_id": 1, "resolution": 0.05, "side": 128, "unit": 0.1}
         tiles = [(column, 0, bytes(50_000)) for column in range(5)]
-        hub.take(msgspec.convert({**about, "version": 1, "more": False, "tiles": tiles}, MapTiles))
+        hub.distribute(msgspec.convert({**about, "version": 1, "more": False, "tiles": tiles}, MapTiles))
         async with house.page() as page:
             await page.welcome()
             seen: set[int] = set()
@@ -296,17 +296,17 @@ def test_a_newcomer_after_many_loops_is_told_how_things_stand(tmp_path: Path) ->
     async def body() -> None:
         hub, viewer = viewers.Hub(), viewers.Viewer(1)
         for number in range(2 * viewers.KEPT):
-            hub.take(Loop(t_mono=float(number), counter=number))
-        hub.lost("nobody listens there")
+            hub.distribute(Loop(t_mono=float(number), counter=number))
+        hub.disconnected("nobody listens there")
         hub.welcome(viewer)
-        message = viewer.take()
+        message = viewer.next_message()
         assert message is not None
         told = msgspec.msgpack.decode(message)
         assert [one["topic"] for one in told] == ["daemon", "history", "loops"]  # no loop that happens now
         assert not told[0]["data"]["up"]
         assert [one["counter"] for one in told[2]["data"]][-1] == 2 * viewers.KEPT - 1
-        hub.take(Loop(t_mono=1e3, counter=1000))
-        message = viewer.take()
+        hub.distribute(Loop(t_mono=1e3, counter=1000))
+        message = viewer.next_message()
         assert message is not None
         assert [one["topic"] for one in msgspec.msgpack.decode(message)] == ["loop"]
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.publish.modbus.holding import CommandCode, Outcome, Request
-from taps.view import orders
-from taps.view.access_guard import Guard
+from daemon.publish.modbus.holding import COMMAND_ADDRESS, CommandCode, Outcome, Request
+from taps import command_client
+from taps.access_guard import Guard
 from taps.view.orders import Orders
 from tests.daemon.publish.network import publishing
-from tests.daemon.publish.test_stream_server import until
+from tests.daemon.publish.stream.test_server import until
 from tests.taps.view.house import TOKEN, House, Page, serving
 from tests.taps.view.test_server import run
 
@@ -99,10 +99,10 @@ def test_the_end_of_another_client_s_order_of_the_same_number_is_not_ours(tmp_pa
             await page.welcome()
             await order(page, "relocalise")
             await page.until("order")
-            wire = await orders._wired("127.0.0.1", modbus.port)
+            wire = await command_client.connect("127.0.0.1", modbus.port)
             try:
                 other = struct.pack(">HH", asked[0].number, CommandCode.SAVE_MAP)
-                await wire.ask(struct.pack(">BHHB", 16, orders.COMMAND_ADDRESS, 2, 4) + other)
+                await wire.request(struct.pack(">BHHB", 16, COMMAND_ADDRESS, 2, 4) + other)
                 modbus.acknowledge(asked[0].number, Outcome.DONE)
                 assert (await page.until("order", lambda one: one["outcome"] != "running"))["outcome"] == "replaced"
                 taken = {await wire.next_number() for _ in range(40)}
@@ -120,13 +120,13 @@ def test_another_map_that_somebody_names_in_between_is_no_map_of_ours(
     tmp_path: Path, between: int | None, said: str
 ) -> None:
     async def body(house: House, asked: list[Request], modbus: Any) -> None:
-        wire = await orders._wired("127.0.0.1", modbus.port)
-        switching = asyncio.create_task(orders.switch_map("agv", "127.0.0.1", modbus.port, 0x77))
+        wire = await command_client.connect("127.0.0.1", modbus.port)
+        switching = asyncio.create_task(command_client.switch_map("agv", "127.0.0.1", modbus.port, 0x77))
         try:
             await until(lambda: bool(asked))
             assert (asked[0].code, asked[0].map_id) == (CommandCode.SWITCH_MAP, 0x77)
             if between is not None:
-                await wire.ask(struct.pack(">BHHBI", 16, orders.MAP_ADDRESS, 2, 4, between))
+                await wire.request(struct.pack(">BHHBI", 16, command_client.MAP_ADDRESS, 2, 4, between))
             modbus.acknowledge(asked[0].number, Outcome.DONE)
             assert await switching == said
         finally:

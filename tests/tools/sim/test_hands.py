@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hal.fake.faults import FaultError, read_fault
+from hal.fake.faults.orders import FaultError, read_fault
 from hal.fake.lidar.models import UTM_30LX
 from tools.sim.hands import VOCABULARY, Hands, Way, start_of, then
 from tools.sim.odometry import Wheels

@@ -26,9 +26,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from daemon.app import Daemon, World
+from daemon.app import Daemon, Environment
 from daemon.config.schema import Config, LidarConfig, ModbusConfig, Mount, OdometryConfig, PhotodiodeConfig, PoseConfig
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
 from daemon.runtime.stall_watch import StallWatch
 from daemon.runtime.warmup import warm_up
 from daemon.runtime.worker import ThreadWorker
@@ -38,7 +38,7 @@ from estimator.mapping.loop_closure import solve_graph
 from estimator.measurements import Answer, Job
 from estimator.pipeline import new_state
 from hal.adc import AdcStatus, RawSamples
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 from hal.bus.i2c import BusOpener
 from hal.clock import Clock, SystemClock
 from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
@@ -183,7 +183,7 @@ class Feeder:
         self._turn("")
         self.told.missed, self.told.scans = daemon.cycle.inbox.dropped, self._number
         os.write(1, b"ended\n")
-        await beside(sys.stdin.readline, "parent")
+        await run_in_thread(sys.stdin.readline, "parent")
         self.stop.set()
         await asyncio.Event().wait()
 
@@ -286,7 +286,7 @@ async def go(wanted: Wanted, drive: Any) -> Told:
     async def warm() -> object:
         return await warm_up(lights=lights)
 
-    world = World(
+    world = Environment(
         SystemClock(), make_lidar=lidar, make_adc=adc, lights=lights, warm_up=warm, make_worker=Solver,
         stream=Path(wanted.stream),
     )  # fmt: skip
@@ -295,7 +295,7 @@ async def go(wanted: Wanted, drive: Any) -> Told:
     await daemon.run(feeder.stop)
     if feeder.failure is not None:
         raise feeder.failure
-    feeder.told.stalls, feeder.told.said = daemon.cycle.taker.pulse.stalls, watch.said
+    feeder.told.stalls, feeder.told.said = daemon.cycle.timing.latest.stalls, watch.said
     return feeder.told
 
 

@@ -17,8 +17,8 @@ from typing import Final
 
 from aiohttp import ClientError, ClientSession, WSMsgType, web
 
-from taps.stream.client import Stream
-from taps.view.access_guard import Guard
+from daemon.publish.stream.client import Stream
+from taps.access_guard import Guard
 from taps.view.command import NICENESS
 from taps.view.page_hello import Scene
 from taps.view.server import TOPICS, View

@@ -29,7 +29,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
 from daemon.runtime.warmup import load
 from daemon.system.realtime import PRIORITY
 from estimator.cdma.air_interface import PROFILE_A

@@ -25,7 +25,9 @@ import numpy as np
 from daemon.config.schema import LidarConfig, Mount
 from daemon.devices.conversion import ScanBridge
 from daemon.runtime.budget import MeasuredBudget
-from daemon.runtime.cycle import Cycle, Parts
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import Parts
+from daemon.runtime.stage_times import StageTimer
 from daemon.runtime.warmup import load
 from daemon.runtime.worker import ThreadWorker, Worker
 from daemon.system.realtime import line_up
@@ -131,7 +133,7 @@ def side(drive: EndlessDrive, count: int, clock: Hands, worker: Worker) -> Side:
         worker=worker,
         status=LidarStatus(link=Link.STREAMING),
         odometry=True,
-        stopwatch=time.perf_counter,
+        timer=StageTimer(time.perf_counter),
     )
     return Side(state, Cycle(parts), Stages((), count))
 

@@ -15,8 +15,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.publish.stream_server import TOPICS, framed
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
+from daemon.publish.stream.server import TOPICS, framed
 from daemon.runtime.warmup import load
 from estimator.cdma.air_interface import PROFILE_A
 from tools.bench.support.children import child

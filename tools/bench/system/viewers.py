@@ -26,7 +26,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
 from daemon.runtime.warmup import load
 from estimator.cdma.air_interface import PROFILE_A
 from tools.bench.support.children import CannotRun, child, ended, lines, two_counts

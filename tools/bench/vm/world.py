@@ -20,11 +20,11 @@ from hal.bus.i2c_server import BusServer
 from hal.clock import SystemClock
 from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.light import OrdinaryLamps
-from hal.fake.control import Control, serve_control
+from hal.fake.faults.control import Control, serve_control
+from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import Unit
-from hal.fake.schedule import FaultSchedule
-from hal.fake.tcp_server import TcpServer
+from hal.fake.transport.tcp_server import TcpServer
 from tools.bench.world.room import LIDAR, room
 from tools.bench.world.stage import ForeignSender
 from tools.sim.feed import UdpSender, feed_odometry, feed_truth

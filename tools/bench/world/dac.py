@@ -22,10 +22,10 @@ import numpy as np
 import numpy.typing as npt
 
 from hal.bus.i2c import Bus, Message, Transferred, write
+from hal.bus.opening import blocking_opener
 from hal.errors import DeviceRefused, HalError
 from hal.fake.adc.chips import SampleSource
 from hal.photodiode.io_errors import explain
-from hal.port.opening import blocking_opener
 
 ADDRESSES: Final = range(0x60, 0x68)
 """A2 and A1 are set at the factory, A0 by a pin."""

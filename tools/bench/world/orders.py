@@ -10,11 +10,11 @@ from typing import Any
 from hal.clock import SystemClock
 from hal.fake.adc.converter import FakeAdc
 from hal.fake.adc.light import OrdinaryLamps
-from hal.fake.faults import FaultError, read_fault
+from hal.fake.faults.orders import FaultError, read_fault
+from hal.fake.faults.schedule import Target
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import LidarModel
 from hal.fake.lidar.scan_world import Room
-from hal.fake.schedule import Target
 from tools.sim import hands
 
 

@@ -142,7 +142,7 @@ def named(expect: Sequence[Expectation]) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """A file, ``text``. ``faults``: tables as :func:`hal.fake.faults.read_fault` takes them."""
+    """A file, ``text``. ``faults``: tables as :func:`hal.fake.faults.orders.read_fault` takes them."""
 
     name: str
     title: str

@@ -20,12 +20,12 @@ from hal.bus.i2c_server import BusServer
 from hal.clock import SystemClock
 from hal.errors import DeviceRefused, HalError
 from hal.fake.adc.converter import FakeBuses
-from hal.fake.faults import read_fault
+from hal.fake.faults.orders import read_fault
+from hal.fake.faults.schedule import FaultSchedule, Target
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import Unit
-from hal.fake.pty_server import PtyServer
-from hal.fake.schedule import FaultSchedule, Target
-from hal.fake.tcp_server import TcpServer
+from hal.fake.transport.pty_server import PtyServer
+from hal.fake.transport.tcp_server import TcpServer
 from hal.net.input_codec import decode, encode
 from tools.bench.system.otherclock import OtherClock
 from tools.bench.world.dac import DacThread

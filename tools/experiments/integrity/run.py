@@ -14,7 +14,8 @@ from daemon.config.schema import LidarConfig, Mount
 from daemon.devices.conversion import SampleBridge, ScanBridge
 from daemon.devices.photodiode import BlockWatch
 from daemon.runtime.budget import FixedBudget
-from daemon.runtime.cycle import Cycle, Parts
+from daemon.runtime.cycle import Cycle
+from daemon.runtime.cycle_parts import Parts
 from daemon.runtime.worker import CycleWorker
 from daemon.snapshot import Snapshot
 from estimator.cdma.air_interface import PROFILE_A

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.calibration.calibrate import calibrate
+from estimator.calibration.calibrate import calibrate_lamps
 from estimator.light_filter.survey import Survey
 from estimator.paper.lateration import Doubt, Method, Received, Solver, locate
 from tools.experiments.report import Cell, Table, Work
@@ -36,7 +36,7 @@ def taught(data: Campaign, train: Index, unit: float, solver: Solver) -> Survey:
     known = nominal(data)
     if solver is not Solver.ML:
         known = replace(known, floor=0.0)
-    found = calibrate(known, rows_of(data, train, unit), PRIORS if solver is Solver.ML else LEVEL)
+    found = calibrate_lamps(known, rows_of(data, train, unit), PRIORS if solver is Solver.ML else LEVEL)
     lamps = tuple(replace(lamp, sigma_ln=max(found.scale, 0.01)) for lamp in found.survey.lamps)
     return replace(found.survey, lamps=lamps)
 

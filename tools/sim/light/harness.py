@@ -8,17 +8,17 @@ from typing import Final
 
 import numpy as np
 
-from daemon.app import World
+from daemon.app import Environment
 from daemon.config.schema import PhotodiodeConfig
 from daemon.devices.conversion import SampleBridge
-from daemon.runtime.light_setup import Lights
+from daemon.devices.light_setup import Lights
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.cdma.epoch import LightEpoch
 from hal.adc import AdcStatus, Blemish, RawSamples
 from hal.bus.i2c import BusOpener
 from hal.clock import Clock
 from hal.fake.adc.converter import FakeBuses
-from hal.fake.schedule import Target
+from hal.fake.faults.schedule import Target
 from hal.lidar import Link
 from tools.sim.ceiling.links import EPOCH_S, PERIOD_S
 from tools.sim.light.scene import LINK, SceneLight
@@ -38,7 +38,7 @@ def lights_of(scene: Scene) -> SceneLight | None:
     return light if isinstance(light, SceneLight) else None
 
 
-def light_up(world: World, light: SceneLight, clock: Clock) -> dict[str, Target]:
+def light_up(world: Environment, light: SceneLight, clock: Clock) -> dict[str, Target]:
     """Give the daemon's surroundings a converter under the lamps; returns what faults may be ordered of."""
     world.lights = Lights(light.survey, PROFILE_A)
     if light.lights.fidelity == LINK:

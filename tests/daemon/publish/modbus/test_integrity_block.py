@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import estimator.result
-from daemon.cli import status
+from daemon.cli import status_table
 from daemon.publish import document
 from daemon.publish.modbus import integrity_block, lights_block, registers
 from daemon.publish.modbus.requests import Responder
@@ -106,14 +106,14 @@ def test_status_shows_the_bound() -> None:
     taken = snapshot(trust=TRUST, loop_residual=0.0123)
     reading = registers.decode_block(registers.encode_block(taken))
     reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(taken))
-    table = status.as_table(reading, stalled=False)
+    table = status_table.as_table(reading, stalled=False)
     assert "bound      0.124 m, 2.01 deg (laser, wheels)  ALERT, limit 0.500 m" in table
     assert "places     3 fit" in table
     assert "residual 0.0123 m" in table
-    assert status.as_object(reading, stalled=False)["witnesses"]["alert"] is True
+    assert status_table.as_object(reading, stalled=False)["witnesses"]["alert"] is True
     reading = registers.decode_block(registers.encode_block(snapshot()))
     reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(snapshot()))
-    assert "bound      none" in status.as_table(reading, stalled=False)
+    assert "bound      none" in status_table.as_table(reading, stalled=False)
 
 
 def contract() -> dict[str, Any]:

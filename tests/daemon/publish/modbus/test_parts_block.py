@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from daemon.cli import status
+from daemon.cli import status_table
 from daemon.health.faults import Fault
 from daemon.publish import document
 from daemon.publish.modbus import integrity_block, lights_block, parts_block, registers, timing_block
@@ -106,7 +106,7 @@ def test_everything_that_is_numbered_has_a_meaning_and_is_on_the_page() -> None:
 def test_status_tells_all_faults_and_what_was_restarted() -> None:
     reading = registers.decode_block(registers.encode_block(snapshot(fault=104)))
     reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(snapshot()))
-    table = status.as_table(
+    table = status_table.as_table(
         reading | parts_block.BLOCK.decode(parts_block.BLOCK.encode(snapshot(condition=CONDITION))), False
     )
     for words in (

@@ -41,7 +41,7 @@ def test_requests_in_pieces(size: int) -> None:
     write = struct.pack(">BHHB6H", 16, 1000, 6, 12, *range(6))
     stream = asked() + asked(write) + asked(b"\x06\x03\xe8\x00\x01") + asked(b"\x07")
     frames = RtuFrames(UNIT)
-    found = [body for at in range(0, len(stream), size) for _, body in frames.take(stream[at : at + size])]
+    found = [body for at in range(0, len(stream), size) for _, body in frames.feed(stream[at : at + size])]
     assert found == [READ, write, b"\x06\x03\xe8\x00\x01", b"\x07"]
     assert frames.skipped == 0
 
@@ -49,17 +49,17 @@ def test_requests_in_pieces(size: int) -> None:
 def test_what_is_for_others_is_passed_over() -> None:
     frames = RtuFrames(UNIT)
     answer = asked(b"\x04\x80" + registers.encode_block(snapshot()), unit=18)
-    assert frames.take(asked(unit=18) + answer + asked()) == [(UNIT, READ)]
-    assert frames.take(asked(unit=0)) == [(0, READ)], "0 is for all"
-    assert frames.take(asked()[:-1] + b"\x00") == []
+    assert frames.feed(asked(unit=18) + answer + asked()) == [(UNIT, READ)]
+    assert frames.feed(asked(unit=0)) == [(0, READ)], "0 is for all"
+    assert frames.feed(asked()[:-1] + b"\x00") == []
 
 
 def test_a_good_request_is_found_at_once_after_any_garbage() -> None:
     @given(st.binary(max_size=600) | st.lists(st.sampled_from([0, UNIT, 4, 16, 255]), max_size=600).map(bytes))
     def run(garbage: bytes) -> None:
         frames = RtuFrames(UNIT)
-        frames.take(garbage)
-        assert (UNIT, READ) in frames.take(asked())
+        frames.feed(garbage)
+        assert (UNIT, READ) in frames.feed(asked())
         assert len(frames._data) <= MAX_FRAME
 
     run()
@@ -99,7 +99,7 @@ def test_the_same_is_found_as_by_looking_at_everything_again(parts: list[bytes],
     stream = b"".join(parts)
     cut = [stream[at : at + size] for at in range(0, len(stream), size)]
     frames = RtuFrames(UNIT)
-    found = [one for piece in cut for one in frames.take(piece)]
+    found = [one for piece in cut for one in frames.feed(piece)]
     assert found == old_take(cut, UNIT)
     assert frames.skipped + len(frames._data) + sum(3 + len(body) for _, body in found) == len(stream)
 
@@ -117,6 +117,6 @@ def test_no_place_is_summed_twice_whatever_comes(monkeypatch: pytest.MonkeyPatch
     stream = bytes([0, 16, 0, 0, 0, 0, 240]) * 300
     frames = RtuFrames(UNIT)
     for byte in stream:
-        frames.take(bytes([byte]))
+        frames.feed(bytes([byte]))
     assert summed <= len(stream) / 7
     assert frames.skipped + len(frames._data) == len(stream)

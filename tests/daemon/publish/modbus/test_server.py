@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from pymodbus.client import AsyncModbusTcpClient, AsyncModbusUdpClient
 
-from daemon.publish.modbus import registers, server
+from daemon.publish.modbus import counts, registers, tcp_endpoint
 from daemon.publish.modbus.holding import Outcome, Request
 from daemon.publish.modbus.server import ModbusPublisher
 from hal.clock import SystemClock
@@ -156,14 +156,14 @@ def test_pipelined_tcp_requests_however_they_are_cut(size: int) -> None:
 def test_small_answers_are_not_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without TCP_NODELAY the second small answer would wait for the client's delayed acknowledgement, 40 ms."""
     delays: list[int] = []
-    made = server.Connection.connection_made
+    made = tcp_endpoint.Connection.connection_made
 
-    def connection_made(self: server.Connection, transport: asyncio.BaseTransport) -> None:
+    def connection_made(self: tcp_endpoint.Connection, transport: asyncio.BaseTransport) -> None:
         sock = transport.get_extra_info("socket")
         delays.append(sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
         made(self, transport)
 
-    monkeypatch.setattr(server.Connection, "connection_made", connection_made)
+    monkeypatch.setattr(tcp_endpoint.Connection, "connection_made", connection_made)
 
     async def run() -> None:
         async with publishing() as publisher, tcp_client(publisher.port) as (reader, writer):
@@ -207,7 +207,7 @@ def test_a_turn_serves_at_most_64_requests(monkeypatch: pytest.MonkeyPatch) -> N
     async def run() -> None:
         async with publishing() as publisher:
             loop = asyncio.get_running_loop()
-            links = [await asyncio.open_connection("127.0.0.1", publisher.port) for _ in range(server.MAX_CONNECTIONS)]
+            links = [await asyncio.open_connection("127.0.0.1", publisher.port) for _ in range(counts.MAX_CONNECTIONS)]
             senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
             for _, writer in links:
                 writer.write(b"".join(request(n, 4, 0, 1) for n in range(100)))
@@ -223,7 +223,7 @@ def test_a_turn_serves_at_most_64_requests(monkeypatch: pytest.MonkeyPatch) -> N
                 loop.call_soon(turn)
 
             turn()
-            await until(lambda: publisher.counts.requests >= server.MAX_CONNECTIONS * 100 + 4 * 50)
+            await until(lambda: publisher.counts.requests >= counts.MAX_CONNECTIONS * 100 + 4 * 50)
             for _, writer in links:
                 writer.close()
             for sock in senders:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from daemon.publish.modbus import registers, server
+from daemon.publish.modbus import counts, registers, tcp_endpoint, udp_endpoint
 from daemon.publish.modbus.server import ModbusPublisher
 from hal.clock import SystemClock, run_virtual
 from tests.daemon.publish.modbus.test_registers import snapshot
@@ -54,7 +54,7 @@ def test_a_malformed_datagram_disturbs_nobody(caplog: pytest.LogCaptureFixture) 
             assert publisher.counts.malformed == len(MALFORMED) * 5
 
     asyncio.run(run())
-    assert [record.message for record in caplog.records] == [f"Modbus: 127.0.0.1 {server.STRANGE}"], "a line a minute"
+    assert [record.message for record in caplog.records] == [f"Modbus: 127.0.0.1 {counts.STRANGE}"], "a line a minute"
 
 
 @pytest.mark.parametrize("rubbish", [b"\x00\x01\x00\x07\x00\x06\x01\x04", b"GET / HTTP/1.1\r\n\r\n", bytes(300)])
@@ -71,7 +71,7 @@ def test_a_tcp_client_that_does_not_speak_modbus_is_closed(rubbish: bytes, caplo
             assert publisher.counts.malformed == 1
 
     asyncio.run(run())
-    assert f"Modbus: 127.0.0.1 {server.STRANGE}" in caplog.text
+    assert f"Modbus: 127.0.0.1 {counts.STRANGE}" in caplog.text
 
 
 def test_clients_that_vanish_leave_nothing_behind() -> None:
@@ -100,7 +100,7 @@ def test_an_answer_that_the_kernel_does_not_take_is_dropped() -> None:
         sock = Full(socket.AF_INET, socket.SOCK_DGRAM)
         sock.setblocking(False)
         sock.bind(("127.0.0.1", 0))
-        endpoint = server.UdpEndpoint(sock, publisher._responder, publisher.counts)
+        endpoint = udp_endpoint.UdpEndpoint(sock, publisher._responder, publisher.counts)
         async with udp_client(sock.getsockname()[1]) as (transport, datagrams):
             transport.sendto(request(1, *BLOCK))
             transport.sendto(request(2, *BLOCK))
@@ -141,7 +141,7 @@ def test_a_defect_is_told_to_the_client_and_wedges_nobody(caplog: pytest.LogCapt
 def test_a_connection_that_cannot_be_served_is_closed_and_the_others_are_served(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    async def body(endpoint: server.TcpEndpoint) -> None:
+    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
         (bad, bad_wire), (good, good_wire) = plugged(endpoint), plugged(endpoint)
 
         def broken(_: int) -> bool:
@@ -230,10 +230,10 @@ def test_a_read_is_never_torn() -> None:
     asyncio.run(run())
 
 
-def in_virtual_time(body: Callable[[server.TcpEndpoint], Coroutine[Any, Any, None]]) -> None:
+def in_virtual_time(body: Callable[[tcp_endpoint.TcpEndpoint], Coroutine[Any, Any, None]]) -> None:
     async def run() -> None:
         publisher = ModbusPublisher(SystemClock())
-        endpoint = server.TcpEndpoint(publisher._responder, publisher.counts)
+        endpoint = tcp_endpoint.TcpEndpoint(publisher._responder, publisher.counts)
         await body(endpoint)
         await endpoint.close()
 
@@ -241,12 +241,12 @@ def in_virtual_time(body: Callable[[server.TcpEndpoint], Coroutine[Any, Any, Non
 
 
 def test_idle_and_half_open_connections_are_dropped() -> None:
-    async def body(endpoint: server.TcpEndpoint) -> None:
+    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
         idle, busy, partial = plugged(endpoint), plugged(endpoint), plugged(endpoint)
         await asyncio.sleep(30.0)
         partial[0].data_received(request(1, *BLOCK)[:7])
         assert not partial[1].gone
-        await asyncio.sleep(server.PARTIAL_S - 1.0)
+        await asyncio.sleep(tcp_endpoint.PARTIAL_S - 1.0)
         assert not partial[1].gone
         for _ in range(10):
             busy[0].data_received(request(1, *BLOCK))
@@ -260,20 +260,20 @@ def test_idle_and_half_open_connections_are_dropped() -> None:
 
 
 def test_a_client_that_trickles_bytes_is_dropped_too() -> None:
-    async def body(endpoint: server.TcpEndpoint) -> None:
+    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
         connection, wire = plugged(endpoint)
         for byte in request(1, *BLOCK)[:11] * 3:
             if wire.gone:
                 break
             connection.data_received(bytes([byte]))
-            await asyncio.sleep(server.PARTIAL_S - 1.0)
+            await asyncio.sleep(tcp_endpoint.PARTIAL_S - 1.0)
         assert wire.gone
 
     in_virtual_time(body)
 
 
 def test_answers_that_are_not_read_stop_the_service_then_the_connection() -> None:
-    async def body(endpoint: server.TcpEndpoint) -> None:
+    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
         connection, wire = plugged(endpoint)
         connection.data_received(request(1, *BLOCK))
         connection.pause_writing()
@@ -282,13 +282,13 @@ def test_answers_that_are_not_read_stop_the_service_then_the_connection() -> Non
                 connection.data_received(request(2, *BLOCK) * 50)
         assert len(wire.sent) == 137, "nothing more is served"
         assert not wire.reading, "nothing more is taken in"
-        await asyncio.sleep(server.STUCK_S - 2.0)
+        await asyncio.sleep(tcp_endpoint.STUCK_S - 2.0)
         connection.resume_writing()
         await asyncio.sleep(4.0)  # each slice of the loop's time holds as many answers as the processor is quick
         assert len(wire.sent) > 137 * 1000
         assert wire.reading
         connection.pause_writing()
-        await asyncio.sleep(server.STUCK_S + 2.0)
+        await asyncio.sleep(tcp_endpoint.STUCK_S + 2.0)
         assert wire.gone
 
     in_virtual_time(body)
@@ -297,18 +297,18 @@ def test_answers_that_are_not_read_stop_the_service_then_the_connection() -> Non
 def test_a_full_house_drops_the_longest_idle_or_refuses(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
 
-    async def body(endpoint: server.TcpEndpoint) -> None:
-        house = [plugged(endpoint) for _ in range(server.MAX_CONNECTIONS)]
+    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+        house = [plugged(endpoint) for _ in range(counts.MAX_CONNECTIONS)]
         _, refused = plugged(endpoint)
         assert refused.gone
         assert endpoint.counts.refused == 1
-        await asyncio.sleep(server.EVICT_S + 1.0)
+        await asyncio.sleep(tcp_endpoint.EVICT_S + 1.0)
         for connection, _ in house[:5] + house[6:]:
             connection.data_received(request(1, *BLOCK))
         _, admitted = plugged(endpoint)
         assert not admitted.gone
         assert [number for number, (_, wire) in enumerate(house) if wire.gone] == [5]
-        assert endpoint.counts.connections == server.MAX_CONNECTIONS
+        assert endpoint.counts.connections == counts.MAX_CONNECTIONS
 
     in_virtual_time(body)
-    assert [record.message.partition(" is ")[2] for record in caplog.records] == [server.CROWDED.removeprefix("is ")]
+    assert [record.message.partition(" is ")[2] for record in caplog.records] == [counts.CROWDED.removeprefix("is ")]

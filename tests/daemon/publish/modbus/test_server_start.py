@@ -16,7 +16,7 @@ from daemon.publish.modbus.server import ModbusPublisher
 from hal.clock import SystemClock
 from hal.errors import DeviceMissing, DeviceRefused
 from hal.net import inet
-from hal.net.reply_address import asked_at
+from hal.net.reply_address import reply_source
 from tests.daemon.publish.network import BLOCK, request, taken_port, udp_client
 
 
@@ -112,7 +112,7 @@ def test_every_address_of_a_computer_answers_for_itself() -> None:
 )
 def test_ipv6_is_answered_from_where_an_answer_can_come(asked: str, interface: int | None) -> None:
     told = socket.inet_pton(socket.AF_INET6, asked) + struct.pack("@I", 3)
-    source = asked_at([(socket.IPPROTO_IPV6, socket.IPV6_PKTINFO, told)])
+    source = reply_source([(socket.IPPROTO_IPV6, socket.IPV6_PKTINFO, told)])
     if interface is None:
         assert source == ()
     else:

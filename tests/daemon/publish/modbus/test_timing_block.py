@@ -10,18 +10,18 @@ from typing import Any
 
 import pytest
 
-from daemon.cli import status
+from daemon.cli import status_table
 from daemon.publish import document
 from daemon.publish.modbus import integrity_block, lights_block, registers, timing_block
 from daemon.publish.modbus.requests import Responder
-from daemon.snapshot import Pulse, Stage
-from estimator.measurements import Rung
+from daemon.snapshot import CycleTiming, Stage
+from estimator.measurements import DegradationLevel
 from tests.daemon.publish.modbus.test_lights_block import ask, layout
 from tests.daemon.publish.modbus.test_registers import snapshot
 
 FROZEN = Path(__file__).parent / "frozen" / f"pulse_v{timing_block.BLOCK.version}.json"
 
-PULSE = Pulse(
+PULSE = CycleTiming(
     rung=2,
     thinned=70_001,
     without_map=2,
@@ -36,7 +36,7 @@ PULSE = Pulse(
 
 
 def test_every_rung_of_the_estimator_has_a_meaning() -> None:
-    assert [rung.value for rung in Rung] == list(range(len(timing_block.RUNGS)))
+    assert [rung.value for rung in DegradationLevel] == list(range(len(timing_block.RUNGS)))
 
 
 def test_block_by_hand() -> None:
@@ -51,7 +51,7 @@ def test_block_by_hand() -> None:
 
 
 def test_what_is_not_known_says_so() -> None:
-    for empty in (snapshot(), snapshot(pulse=Pulse())):
+    for empty in (snapshot(), snapshot(pulse=CycleTiming())):
         reading = timing_block.BLOCK.decode(timing_block.BLOCK.encode(empty))
         known = {name: value for name, value in reading.items() if value is not None}
         assert known == {"seq": 70_000, "rung": 0, "thinned": 0, "without_map": 0, "carried": 0, "stalls": 0}
@@ -111,11 +111,11 @@ def test_the_page_says_where_everything_is() -> None:
 def test_status_tells_what_is_left_out_and_when_it_stood_still() -> None:
     reading = registers.decode_block(registers.encode_block(snapshot()))
     reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(snapshot()))
-    calm = status.as_table(
-        reading | timing_block.BLOCK.decode(timing_block.BLOCK.encode(snapshot(pulse=Pulse()))), stalled=False
+    calm = status_table.as_table(
+        reading | timing_block.BLOCK.decode(timing_block.BLOCK.encode(snapshot(pulse=CycleTiming()))), stalled=False
     )
     assert "over budget\n" in calm
-    table = status.as_table(
+    table = status_table.as_table(
         reading | timing_block.BLOCK.decode(timing_block.BLOCK.encode(snapshot(pulse=PULSE))), stalled=False
     )
     assert "99 of 100 within 0.00800 s; no map work either; stood still 4 times, latest 0.123 s in MATCH" in table

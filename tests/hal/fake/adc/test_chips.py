@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hal.fake.adc.chips import T_ACQUIRE_S, Adc121c021, Ads1x15, Lm75, Mcp3221
-from hal.fake.adc.i2c_timing import Line
+from hal.fake.adc.i2c_timing import SclTiming
 
-LINE = Line(10.0, 400e3)
+LINE = SclTiming(10.0, 400e3)
 
 
 def constant(value: float) -> object:
@@ -45,15 +45,15 @@ def test_conversions_are_18_clocks_apart_and_begin_after_the_address() -> None:
 
 
 def test_a_stall_delays_what_comes_after_it() -> None:
-    line = Line(0.0, 400e3, ((9.5 + 9 * 2, 1e-3),))
+    line = SclTiming(0.0, 400e3, ((9.5 + 9 * 2, 1e-3),))
     assert line.times([8, 26, 28, 44]) == pytest.approx(np.array([8, 26, 428, 444]) / 400e3)
 
 
 def test_the_first_word_after_a_pause_is_an_old_one() -> None:
     chip = Mcp3221(lambda t: t / 20.0)
     chip.read(200, LINE)
-    fresh = chip.read(4, Line(10.01, 400e3))
-    old = chip.read(4, Line(11.0, 400e3))
+    fresh = chip.read(4, SclTiming(10.01, 400e3))
+    old = chip.read(4, SclTiming(11.0, 400e3))
     assert int.from_bytes(fresh[:2], "big") == int(4096 * 10.01 / 20)
     assert int.from_bytes(old[:2], "big") == int(4096 * 10.01 / 20)
     assert int.from_bytes(old[2:], "big") == int(4096 * 11.0 / 20)
@@ -93,10 +93,10 @@ def test_ads1115_continuous() -> None:
     chip = Ads1x15(constant(0.5), supply_v=3.3)  # type: ignore[arg-type]  # a sample source
     chip.write(b"\x01\x42\x83", 10.0)
     chip.write(b"\x00", 10.0)
-    assert chip.read(2, Line(10.0 + 0.9 / 128, 400e3)).hex() == "0000"  # the first conversion is still running
-    assert chip.read(4, Line(10.0 + 1.1 / 128, 400e3)).hex() == f"{round(1.65 / 4.096 * 32768):04x}" * 2
+    assert chip.read(2, SclTiming(10.0 + 0.9 / 128, 400e3)).hex() == "0000"  # the first conversion is still running
+    assert chip.read(4, SclTiming(10.0 + 1.1 / 128, 400e3)).hex() == f"{round(1.65 / 4.096 * 32768):04x}" * 2
     chip.write(b"\x01", 10.1)
-    assert chip.read(2, Line(10.1, 400e3)).hex() == "4283"
+    assert chip.read(2, SclTiming(10.1, 400e3)).hex() == "4283"
 
 
 def test_ads1115_keeps_the_old_result_while_the_new_range_takes_effect() -> None:
@@ -105,28 +105,28 @@ def test_ads1115_keeps_the_old_result_while_the_new_range_takes_effect() -> None
     old = round(0.825 / 4.096 * 32768)
     chip.write(b"\x01\x44\x83", 1.0)  # 2.048 V
     chip.write(b"\x00", 1.0)
-    assert int.from_bytes(chip.read(2, Line(1.0 + 1.9 / 128, 400e3)), "big") == old
-    assert int.from_bytes(chip.read(2, Line(1.0 + 2.1 / 128, 400e3)), "big") == round(0.825 / 2.048 * 32768)
+    assert int.from_bytes(chip.read(2, SclTiming(1.0 + 1.9 / 128, 400e3)), "big") == old
+    assert int.from_bytes(chip.read(2, SclTiming(1.0 + 2.1 / 128, 400e3)), "big") == round(0.825 / 2.048 * 32768)
 
 
 def test_ads1015_is_left_justified_and_slow_or_fast() -> None:
     chip = Ads1x15(lambda t: t / 100.0, bits=12, oscillator=-0.1)
     chip.write(b"\x01\x42\x83", 0.0)  # DR 4 is 1600 samples/s here
     chip.write(b"\x00", 0.0)
-    word = int.from_bytes(chip.read(2, Line(50.0, 400e3)), "big")
+    word = int.from_bytes(chip.read(2, SclTiming(50.0, 400e3)), "big")
     assert word & 0xF == 0
     assert word == round(0.5 * 3.3 / 4.096 * 32768) & 0xFFF0
-    assert chip.read(2, Line(0.9 / 1440, 400e3)) == b"\x00\x00"
-    assert chip.read(2, Line(1.1 / 1440, 400e3)) == b"\x00\x00"  # 0.35 ms of a slow rise: below one step
+    assert chip.read(2, SclTiming(0.9 / 1440, 400e3)) == b"\x00\x00"
+    assert chip.read(2, SclTiming(1.1 / 1440, 400e3)) == b"\x00\x00"  # 0.35 ms of a slow rise: below one step
 
 
 def test_ads1115_single_shot() -> None:
     chip = Ads1x15(constant(0.5))  # type: ignore[arg-type]  # a sample source
     chip.write(b"\x01\xc3\x83", 1.0)
-    assert chip.read(2, Line(1.0 + 0.5 / 128, 400e3)).hex() == "4383"  # busy
-    assert chip.read(2, Line(1.0 + 1.5 / 128, 400e3)).hex() == "c383"  # done
+    assert chip.read(2, SclTiming(1.0 + 0.5 / 128, 400e3)).hex() == "4383"  # busy
+    assert chip.read(2, SclTiming(1.0 + 1.5 / 128, 400e3)).hex() == "c383"  # done
     chip.write(b"\x00", 1.1)
-    assert chip.read(2, Line(1.1, 400e3)) != b"\x00\x00"
+    assert chip.read(2, SclTiming(1.1, 400e3)) != b"\x00\x00"
 
 
 def test_lm75() -> None:

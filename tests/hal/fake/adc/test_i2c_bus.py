@@ -12,7 +12,7 @@ from hal.bus.i2c import Message, Transferred, read, write
 from hal.fake.adc.converter import FakeAdc
 from hal.fake.adc.faults import ADC
 from hal.fake.adc.i2c_adapters import ADAPTERS, BCM2835, CP2112, DESIGNWARE, FT260, I2C_GPIO, Adapter
-from hal.fake.faults import FaultError, read_fault
+from hal.fake.faults.orders import FaultError, read_fault
 
 BLOCK = (read(0x4D, 1000),)
 QUIET = Adapter("quiet", jitter_s=0.0, nack=errno.ENXIO)
@@ -96,7 +96,7 @@ def test_adapters_have_limits(adapter: Adapter, messages: tuple[Message, ...], c
 
 
 def test_a_slow_bus_runs_into_the_time_out_and_is_lame_once() -> None:
-    device = adc(Adapter("old", scl_hz=100e3, timeout_s=0.15, lame_after_timeout=True))
+    device = adc(Adapter("old", scl_hz=100e3, timeout_s=0.15, fails_after_timeout=True))
     begun = device.bus.begin((read(0x4D, 2000),))
     assert begun.code == errno.ETIMEDOUT
     assert begun.t_end - begun.t0 == pytest.approx(0.15, abs=1e-3)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from hal.adc import RawSamples
+from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import DataInvalid
 from hal.fake.adc.light import OrdinaryLamps, RecordedLight
 from hal.photodiode.dc_channel import LevelInput
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
-from hal.port.opening import open_bus
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:

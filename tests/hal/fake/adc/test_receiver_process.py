@@ -15,13 +15,13 @@ from pathlib import Path
 import pytest
 
 from hal.adc import Blemish, RawSamples
+from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import DeviceFault, DeviceMissing, HalError
 from hal.lidar import Link
 from hal.photodiode.dc_channel import LevelInput
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
 from hal.photodiode.probe import probe_buses
-from hal.port.opening import open_bus
 
 pytestmark = [pytest.mark.system, pytest.mark.realtime]
 SLACK = 4.0

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hal.errors import DeviceMissing
-from hal.fake.faults import FaultError
+from hal.fake.faults.orders import FaultError
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.faults import LIDAR
 from hal.fake.lidar.models import URG_04LX, UTM_30LX, Unit

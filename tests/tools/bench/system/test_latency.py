@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from hal.blocking_calls import beside
+from hal.blocking_calls import run_in_thread
 from tools.bench.support import children
 from tools.bench.support import readers as support_readers
 from tools.bench.system import latency
@@ -114,7 +114,7 @@ def test_the_load_asks_only_while_it_is_served(tmp_path: Path) -> None:
             load = latency.Load(port, path, undo)
             load.turn(True)
             await asyncio.wait_for(asked.wait(), 20.0)
-            counts = await beside(load.end, "end")
+            counts = await run_in_thread(load.end, "end")
         transport.close()
         server.close()
         await server.wait_closed()

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.daemon.publish.test_stream_server import serve, until
+from tests.daemon.publish.stream.test_server import serve, until
 from tests.tools.bench.system.test_viewers import told
 from tools.bench.support.children import ROOT
 from tools.bench.system.stalled import TAPS, Taps, figures

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from taps.view import server
-from tests.daemon.publish.test_stream_server import serve, until
+from tests.daemon.publish.stream.test_server import serve, until
 from tests.taps.view.house import snapshot
 from tools.bench.support.drive import PERIOD_S
 from tools.bench.support.paced import SETTLE_S, Feeder, Wanted

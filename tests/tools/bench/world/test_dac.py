@@ -11,8 +11,8 @@ import pytest
 
 from hal.bus.i2c import Message, Transferred
 from hal.errors import DeviceRefused
-from tests.daemon.lightroom import CODES, Lit
 from tests.daemon.scenarios.test_lights import Bench, run_daemon
+from tests.daemon.support.light_room import CODES, Lit
 from tools.bench.world.dac import CLOCKS, Player, encoded
 
 Floats = np.ndarray

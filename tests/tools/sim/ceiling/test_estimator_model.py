@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.calibration.calibrate import PRIORS, Priors, calibrate
+from estimator.calibration.calibrate import PRIORS, Priors, calibrate_lamps
 from estimator.calibration.observations import Rows
 from tools.sim.ceiling.ceiling import IDEAL, Ceiling, Effects, paper_ceiling
 from tools.sim.ceiling.records import survey
@@ -35,7 +35,7 @@ def left_over(ceiling: Ceiling, priors: Priors, places: int = 300) -> float:
     place, lamp = np.nonzero(plain)
     none = np.zeros(len(place))
     rows = Rows(poses[place], lamp.astype(np.int64), received[place, lamp], none + 1e-4, none)
-    fit = calibrate(survey(ceiling), rows, priors)
+    fit = calibrate_lamps(survey(ceiling), rows, priors)
     assert len(fit.after) > 1000
     return float(np.sqrt(np.mean(fit.after**2)))
 

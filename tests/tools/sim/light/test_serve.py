@@ -12,7 +12,7 @@ import pytest
 
 from daemon.config.survey_loader import read_survey
 from hal.bus.i2c import read
-from hal.port.opening import open_bus
+from hal.bus.opening import open_bus
 from tools.sim.light.scene import Lights
 from tools.sim.light.serve import serve_light, write_plan
 from tools.sim.run import main

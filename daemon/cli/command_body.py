@@ -1,0 +1,103 @@
+"""How a command's body is found and run: its module is loaded when the command runs, with the configuration resolved.
+
+Options that several commands share are here, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+from daemon.system.console import OK, USAGE, fail, say
+from daemon.system.extras import how_to_install
+
+OURS = ("daemon", "estimator", "hal", "taps")
+
+Body = Callable[[argparse.Namespace], int]
+"""Runs a command and returns the exit code."""
+
+
+def config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None:
+    """The options of every command that reads the configuration; see :func:`configured`."""
+    if file:
+        parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file; default: built-in values")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrule one key")
+    parser.add_argument("--print-config", action="store_true", help="print the resolved configuration and stop")
+
+
+def later(module: str, name: str) -> Body:
+    """A body that resolves the configuration (``args.settings``, a `Config`) and then loads its module."""
+    return configured(loaded(module, name))
+
+
+def estimating(module: str, name: str, what: str = "warm") -> Body:
+    """As `later`, for a module that imports ``what`` of the estimator: the minute that it may compile is announced."""
+
+    def body(args: argparse.Namespace) -> int:
+        from daemon.runtime import warmup
+
+        try:
+            warmup.load_aloud(say, what, warmup.load, module)
+        except warmup.CannotLoad as error:
+            return fail(str(error))
+        return loaded(module, name)(args)
+
+    return configured(body)
+
+
+def loaded(module: str, name: str) -> Body:
+    """A body that loads its module when it runs."""
+
+    def body(args: argparse.Namespace) -> int:
+        run: Body = getattr(import_module(module), name)
+        return run(args)
+
+    return body
+
+
+def configured(body: Body) -> Body:
+    """A body that is run with the resolved configuration as ``args.settings``."""
+
+    def resolve_and_run(args: argparse.Namespace) -> int:
+        from daemon.config import loader
+
+        overrides = list(args.set)
+        if getattr(args, "lidar", None):
+            overrides.append(f"lidar.device={args.lidar}")
+        try:
+            args.settings = loader.load(args.config, overrides)
+        except loader.ConfigError as error:
+            return fail(str(error), USAGE)
+        if args.print_config:
+            sys.stdout.write(loader.dump(args.settings))
+            return OK
+        return body(args)
+
+    return resolve_and_run
+
+
+def listening(parser: argparse.ArgumentParser) -> None:
+    """The options that say which daemon to listen to; ``args.stream``: Path or None for the configuration's."""
+    parser.add_argument(
+        "--stream", type=Path, metavar="SOCKET", help="the daemon's local stream; default: that of the configured name"
+    )
+    config_arguments(parser)
+
+
+def needing(extra: str, module: str, name: str) -> Body:
+    """A body that resolves the configuration and then loads its module, which needs an extra of the package."""
+
+    def body(args: argparse.Namespace) -> int:
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing in OURS:
+                raise
+            return fail(f"this command needs {missing}, which is not installed: {how_to_install(extra)}")
+        return loaded(module, name)(args)
+
+    return configured(body)

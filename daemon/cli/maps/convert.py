@@ -1,0 +1,82 @@
+"""``lumiloop map export|render|import``: a map file as other programs read it, and one made of what they wrote."""
+
+from __future__ import annotations
+
+import argparse
+import secrets
+import sys
+import time
+
+import numpy as np
+
+from daemon.maps.carmen import carmen
+from daemon.maps.container import BadMap
+from daemon.maps.edit import LONGEST_NAME, Refused, called, keep, opened, put
+from daemon.maps.grid_files import map_yaml, pgm
+from daemon.maps.image import image_from, meta_of, packed
+from daemon.maps.image_geometry import grid_of, lamps_of, placed
+from daemon.maps.map_drawing import draw
+from daemon.maps.map_server import BadMapServer, load
+from daemon.maps.png import encode_png
+from daemon.replay.results import Folder, OutputRefused, Trajectory, tum
+from daemon.system import console
+from daemon.system.versions import release
+from estimator import Identity, image_of_cells
+
+
+def export(args: argparse.Namespace) -> int:
+    """Write what is asked for of a map file; returns the exit code."""
+    try:
+        image = image_from(opened(args.log))
+        folder = Folder(args.out)
+        frames = placed(image)
+        written: list[str] = []
+        if args.pgm or not (args.tum or args.carmen):
+            grid = grid_of(image)
+            picture = encode_png(draw(grid, np.zeros((0, 3)), lamps_of(image)))
+            files = [("map.pgm", pgm(grid)), ("map.yaml", map_yaml(grid, "map.pgm")), ("map.png", picture)]
+            folder.write_each(files)
+            written += [name for name, _ in files]
+        if args.tum:
+            stamps = np.array([frame.key for frame, _ in frames], dtype=np.float64)
+            folder.write("keyframes.tum", tum(Trajectory(stamps, np.array([T for _, T in frames]).reshape(-1, 3))))
+            written.append("keyframes.tum")
+        if args.carmen:
+            scans = ((frame.key, T, frame.T_base_lidar, frame.beams()) for frame, T in frames)
+            folder.write("keyframes.clf", carmen(scans))
+            written.append("keyframes.clf")
+    except (BadMap, OutputRefused, OSError) as error:
+        return console.fail(str(error))
+    sys.stdout.write(f"{args.out}: {', '.join(written)}\n")
+    return console.OK
+
+
+def render(args: argparse.Namespace) -> int:
+    """Draw a map file as a picture; returns the exit code."""
+    try:
+        image = image_from(opened(args.map))
+        pixels = draw(grid_of(image), np.zeros((0, 3)), lamps_of(image))
+        Folder(args.out.parent).write(args.out.name, encode_png(pixels))
+    except (BadMap, OutputRefused, OSError) as error:
+        return console.fail(str(error))
+    sys.stdout.write(f"{args.out}: {pixels.shape[1]} x {pixels.shape[0]} pixels\n")
+    return console.OK
+
+
+def take_in(args: argparse.Namespace) -> int:
+    """Make a map file of one of map_server's; returns the exit code."""
+    try:
+        described, cells = load(args.yaml)
+        named = called(args.name) if args.name else args.yaml.stem[:LONGEST_NAME]
+        identity = Identity(1 + secrets.randbelow(2**32 - 1), named)
+        origin = np.array(described.origin)
+        image = image_of_cells(cells, described.resolution, origin, identity)
+        content = packed(image, meta_of(image, time.time(), "", release()))
+        path = keep(args.settings, content, identity.map_id) if args.out is None else put(args.out, content)
+    except (BadMapServer, BadMap, Refused, OSError) as error:
+        return console.fail(str(error))
+    except ValueError as error:
+        return console.fail(f"{args.yaml}: {error}")
+    wide, tall = cells.shape[1] * described.resolution, cells.shape[0] * described.resolution
+    sys.stdout.write(f"{path}: map {identity.map_id:08x} of {wide:.1f} x {tall:.1f} m, {len(image.submaps)} submaps\n")
+    return console.OK

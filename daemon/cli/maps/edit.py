@@ -1,0 +1,47 @@
+"""``lumiloop map align|name``: change a map file."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import secrets
+import sys
+
+import msgspec
+
+from daemon.maps.container import BadMap
+from daemon.maps.edit import Refused, called, fitted, judge, moved, opened, pair_of, written
+from daemon.system import console
+
+
+def align(args: argparse.Namespace) -> int:
+    """Move a map so that points of it come to lie where a person says; returns the exit code."""
+    try:
+        stored = opened(args.map)
+        if stored.meta.surveyed:
+            raise Refused(f"{args.map}: lies in the frame of the lamps' survey; move the lamps in the survey instead")
+        fit = fitted([pair_of(text) for text in args.point])
+        judge(fit)
+        meta = msgspec.structs.replace(stored.meta, map_id=1 + secrets.randbelow(2**32 - 1))
+        path = written(args.map, args.out, moved(stored.tables, fit.T), meta)
+    except (BadMap, Refused, OSError) as error:
+        return console.fail(str(error))
+    x, y, yaw = fit.T
+    off = ", ".join(f"{1e3 * one:.0f} mm" for one in fit.residual_m)
+    sys.stdout.write(
+        f"moved by x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(yaw):.2f} deg; points are off by {off}; "
+        f"distances are {100.0 * (fit.scale - 1.0):+.2f} % of the map's\n{path}: map {meta.map_id:08x}\n"
+    )
+    return console.OK
+
+
+def name(args: argparse.Namespace) -> int:
+    """Say which floor or building a map is of; returns the exit code."""
+    try:
+        stored = opened(args.map)
+        meta = msgspec.structs.replace(stored.meta, name=called(args.text))
+        path = written(args.map, args.out, stored.tables, meta)
+    except (BadMap, Refused, OSError) as error:
+        return console.fail(str(error))
+    sys.stdout.write(f"{path}: map {meta.map_id:08x} is called {meta.name!r}\n")
+    return console.OK

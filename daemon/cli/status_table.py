@@ -1,0 +1,231 @@
+"""A reading of the published block for a person, as a table, and for a program, as an object."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from enum import IntEnum
+from typing import Any, Final
+
+from daemon.publish.modbus import integrity_block, parts_block, registers, timing_block
+from daemon.publish.modbus.client import Reading
+from daemon.publish.modbus.points import U16, Value
+from daemon.snapshot import GUESSED, LISTED_LINKS, LightFix, LinkUse, Stage, State
+
+_TOP: Final = U16.span[1] / 10_000  # where ages and sigmas, 16 bits of 0.1 ms or 0.1 mm, saturate
+_GUESS: Final = "  (a guess: the place is not known)"
+
+
+def as_object(reading: Reading, stalled: bool) -> dict[str, Any]:
+    """The reading with its codes and bits spelled out."""
+    spelled = {
+        "state": _state(reading["state"]),
+        "reason_text": _meaning("reason", reading["reason"]),
+        "fault_text": _meaning("fault", reading["fault"]),
+        "flags": registers.decode_bits(registers.FLAGS, reading["flags"]),
+        "devices": registers.decode_bits(registers.DEVICES, reading["devices"]),
+        "stalled": stalled,
+    }
+    if "witnesses" in reading:
+        spelled |= {"witnesses": registers.decode_bits(integrity_block.WITNESSES, reading["witnesses"])}
+    if "light_fix" in reading:
+        spelled |= {"light_fix": _fix(reading), "light_links": [dict(link) for link in _links(reading)]}
+    return {key: value for key, value in reading.items() if not key.startswith("link_")} | spelled
+
+
+def _fix(reading: Reading) -> str | None:
+    number = reading["light_fix"]
+    return None if number is None else _name(LightFix, number)
+
+
+def _links(reading: Reading) -> Iterator[dict[str, Any]]:
+    """Every link in view, strongest first."""
+    for row in range(1, LISTED_LINKS + 1):
+        if (code := reading[f"link_{row}_code"]) is not None:
+            link = {name: reading[f"link_{row}_{name}"] for name in ("lamp", "use", "strength", "residual")}
+            yield {"code": code, **link, "use": _name(LinkUse, link["use"])}
+
+
+def as_table(reading: Reading, stalled: bool) -> str:
+    """The reading for a person: one line a subject."""
+    flags = registers.decode_bits(registers.FLAGS, reading["flags"])
+    starting = reading["state"] == State.STARTING  # no cycle yet: nothing is published anew, no device judged
+    still = "  (STANDS STILL: no new snapshot)" if stalled and not starting else ""
+    rows = [
+        ("state", _state(reading["state"]) + still),
+        ("reason", _meaning("reason", reading["reason"])),
+        ("fault", _meaning("fault", reading["fault"])),
+        *_more_faults(reading),
+        ("map pose", _pose(reading, "map") + _reserve(reading["state"], flags)),
+        ("sigma", _triple(reading, ("sigma_x", "sigma_y", "sigma_yaw"), "m", "")),
+        *_trust(reading),
+        ("odom pose", _pose(reading, "odom")),
+        ("speed", _triple(reading, ("v_x", "v_y", "yaw_rate"), "m/s", "/s")),
+        ("age", _bounded(reading["age"], "s")),
+        ("map", f"id {reading['map_id']:08x}, {reading['jumps']} jumps"),
+        ("loops", _loops(reading)),
+        *_lights(reading),
+        ("scans", f"{_number(reading['scan_rate'], 'Hz', 2)}, {reading['missed']} missed"),
+        ("cycle", f"{_number(reading['cycle'], 's', 5)}, {reading['overruns']} over budget{_left_out(reading)}"),
+        ("devices", _devices(reading["devices"], starting)),
+        *_parts(reading),
+        ("snapshot", f"{reading['seq']}, {_date(reading['t_utc'])}"),
+    ]
+    return "\n".join(f"{label:<10} {text}".rstrip() for label, text in rows)
+
+
+def _more_faults(reading: Reading) -> list[tuple[str, str]]:
+    """Faults beside the gravest."""
+    numbers = [reading.get(f"fault_{k}") for k in range(2, parts_block.FAULTS + 1)]
+    return [("", _meaning("fault", number)) for number in numbers if number]
+
+
+def _parts(reading: Reading) -> list[tuple[str, str]]:
+    """For how long it runs, what had to be restarted, what is down or hangs."""
+    if "uptime" not in reading:
+        return []
+    counts = {part.name: reading[f"restarts_{part.name.lower()}"] for part in parts_block.PARTS}
+    restarted = ", ".join(f"{name} {count:g}" for name, count in counts.items() if count)
+    said = f"{reading['uptime']:g} s" + (f"; restarted: {restarted}" if restarted else "")
+    for word, table in (("down", parts_block.PARTS), ("hanging", parts_block.THREADS)):
+        names = [member.name for member in table if int(reading[word] or 0) >> member & 1]
+        said += f"; {word}: {', '.join(names)}" if names else ""
+    return [("running", said)]
+
+
+def _state(number: Value) -> str:
+    return _name(State, number)
+
+
+def _name(table: type[IntEnum], number: Value) -> str:
+    try:
+        return table(int(number or 0)).name
+    except ValueError:
+        return f"unknown to this reader ({number})"
+
+
+def _meaning(subject: str, number: Value) -> str:
+    """What a reason or fault number means and what to do; the tables are loaded only when there is one to explain."""
+    if not number:
+        return "none"
+    from daemon.health.faults import FAULTS
+    from daemon.health.reasons import REASONS
+
+    meanings: Mapping[Any, tuple[str, str]] = REASONS if subject == "reason" else FAULTS
+    text, remedy = meanings.get(int(number), ("unknown to this reader", "use the daemon's own version of this command"))
+    return f"{number}: {text}" + (f" ({remedy})" if remedy else "")
+
+
+def _number(value: Value, unit: str, digits: int = 4) -> str:
+    return "not known" if value is None else f"{value:.{digits}f} {unit}"
+
+
+def _bounded(value: Value, unit: str) -> str:
+    """An age, a sigma or a speed; a register at its largest value says that much or more.
+
+    Speeds have a coarser step and never read as just that.
+    """
+    return f"> {math.floor(10.0 * _TOP) / 10.0} {unit}" if value is not None and value >= _TOP else _number(value, unit)
+
+
+def _angle(value: Value) -> str:
+    return "not known" if value is None else f"{math.degrees(value):.2f} deg"
+
+
+def _triple(reading: Reading, names: tuple[str, str, str], unit: str, per: str) -> str:
+    x, y, yaw = (reading[name] for name in names)
+    if x is None and y is None and yaw is None:
+        return "not known"
+    return f"{_bounded(x, unit)}, {_bounded(y, unit)}, {_angle(yaw)}{per}"
+
+
+def _left_out(reading: Reading) -> str:
+    """How long cycles take, what they leave out, and when they stood still, as far as it is known and worth a word."""
+    long, rung, stalls = reading.get("cycle_p99"), int(reading.get("rung") or 0), reading.get("stalls")
+    said = f", 99 of 100 within {_number(long, 's', 5)}" if long is not None else ""
+    said += f"; {timing_block.RUNGS[rung]}" if 0 < rung < len(timing_block.RUNGS) else ""
+    if not stalls:
+        return said
+    number = reading["stall_in"]
+    where = "" if number is None else f" in {_name(Stage, number)}"
+    return f"{said}; stood still {stalls:g} times, latest {_number(reading['stall'], 's', 3)}{where}"
+
+
+def _trust(reading: Reading) -> list[tuple[str, str]]:
+    """The bound on the error, what it rests on, and whether it is above the limit that is set."""
+    if "witnesses" not in reading:
+        return []
+    bits = registers.decode_bits(integrity_block.WITNESSES, reading["witnesses"])
+    if reading["protection"] is None:
+        text = "none"
+    else:
+        names = {"laser_bounds": "laser", "light_bounds": "light", "wheels_bound": "wheels"}
+        rests = ", ".join(name for bit, name in names.items() if bits[bit])
+        text = f"{_number(reading['protection'], 'm', 3)}, {_angle(reading['protection_yaw'])} ({rests})"
+    limit = reading["alert_limit"]
+    alert = "" if limit is None else f"{'  ALERT' if bits['alert'] else ''}, limit {limit:.3f} m"
+    places = reading["places"]
+    return [("bound", text + alert), *([] if places is None else [("places", f"{places:g} fit")])]
+
+
+def _lights(reading: Reading) -> list[tuple[str, str]]:
+    """How many lamps, what lights alone say, and a line for every link."""
+    if reading["links"] is None:
+        return [("lights", "no photodiode configured")]
+    strongest = reading["light_id"]
+    rows = [("lights", f"{reading['links']} in view" + ("" if strongest is None else f", strongest lamp {strongest}"))]
+    if "light_fix" not in reading:
+        return rows
+    names = ("light_sigma_x", "light_sigma_y", "light_sigma_yaw")
+    rows.append(
+        ("light fix", f"{_fix(reading)}, {reading['light_used']} used, age {_bounded(reading['light_age'], 's')}")
+    )
+    rows.append(("light pose", _pose(reading, "light")))
+    rows.append(("", f"sigma {_triple(reading, names, 'm', '')}"))
+    links = list(_links(reading))
+    if links:
+        rows.append(("links", f"{'lamp':>6} {'code':>5} {'strength':>12} {'residual':>9}  use"))
+    for link in links:
+        lamp = "-" if link["lamp"] is None else link["lamp"]
+        residual = "-" if link["residual"] is None else f"{100.0 * math.expm1(link['residual']):+.1f} %"
+        rows.append(("", f"{lamp:>6} {link['code']:>5} {1e9 * link['strength']:>9.2f} nA {residual:>9}  {link['use']}"))
+    return rows
+
+
+def _pose(reading: Reading, frame: str) -> str:
+    if reading[f"{frame}_x"] is None:
+        return "not known"
+    x, y, yaw = (reading[f"{frame}_{axis}"] for axis in ("x", "y", "yaw"))
+    return f"x {_number(x, 'm')}, y {_number(y, 'm')}, yaw {_angle(yaw)}"
+
+
+def _unknown_axes(flags: dict[str, bool]) -> str:
+    missing = [axis for axis in ("x", "y", "yaw") if not flags[f"{axis}_known"]]
+    return f"  (not observed: {', '.join(missing)})" if flags["pose_valid"] and missing else ""
+
+
+def _reserve(state: Value, flags: dict[str, bool]) -> str:
+    """What has to be known of a pose before it is used."""
+    return _GUESS if state in GUESSED and flags["pose_valid"] else _unknown_axes(flags)
+
+
+def _loops(reading: Reading) -> str:
+    if reading["loop_new"] is None:
+        return f"{reading['loop_counter']}"
+    fits = f", residual {_number(reading['loop_residual'], 'm')}" if reading.get("loop_residual") is not None else ""
+    return f"{reading['loop_counter']}, latest: keyframe {reading['loop_new']} to {reading['loop_old']}{fits}"
+
+
+def _devices(word: Value, starting: bool) -> str:
+    bits = registers.decode_bits(registers.DEVICES, word)
+    fitted = [name for name in ("lidar", "adc", "odometry") if bits[f"{name}_fitted"]]
+    if starting and fitted:
+        return f"{', '.join(fitted)}: told from the first cycle on"
+    return ", ".join(f"{name} {'ok' if bits[f'{name}_ok'] else 'NOT OK'}" for name in fitted) or "none configured"
+
+
+def _date(t_utc: Value) -> str:
+    if not t_utc:
+        return "no time"
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(t_utc))

@@ -1,0 +1,116 @@
+"""Setup of the light channel: the survey, the air interface, the sample clock, and the residual map.
+
+It is read once, kept in a recording, and taken from there by a replay: the survey file may have changed since. All
+of it is in the head of every segment but the residual map, which is large: a file in the recording's folder holds it.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from daemon.config.schema import Config
+from daemon.config.survey_loader import SurveyError, read_survey, residuals_beside
+from daemon.devices.photodiode import profile_of
+from estimator import PROFILES, Profile, Survey
+
+HEADER: Final = "lights"
+"""Key of a recording's head."""
+RESIDUALS: Final = "lights.residuals.npz"
+"""File of a recording's folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lights:
+    """A photodiode and what it looks at.
+
+    Attributes:
+        survey: lamps and receiver; without lamps in it they have to describe themselves.
+        profile: air interface. clock_ppm: stored error of the sample clock; None: to be found.
+        residuals: content of the residual map beside the survey, empty without one; read by the estimator's loader.
+    """
+
+    survey: Survey
+    profile: Profile
+    clock_ppm: float | None = None
+    residuals: bytes = b""
+
+    def header(self) -> dict[str, Any]:
+        """What a recording keeps in the head of every segment."""
+        kept = {
+            "survey": msgspec.to_builtins(self.survey),
+            "profile": self.profile.name,
+            "clock_ppm": self.clock_ppm,
+            "residuals_sha256": _digest(self.residuals),
+        }
+        return {HEADER: kept}
+
+
+def load_lights(settings: Config, clock_ppm: float | None = None) -> Lights | None:
+    """What the configuration says of lights; None where there is no photodiode.
+
+    Raises:
+        SurveyError: the survey cannot be used; names the place and the remedy.
+    """
+    path = settings.lights.survey
+    profile = profile_of(settings.photodiode)
+    survey = read_survey(Path(path), profile) if path else Survey(depth=profile.depth)
+    if not settings.photodiode.fitted:
+        return None
+    return Lights(survey, profile, clock_ppm, read_residuals(Path(path)) if path else b"")
+
+
+def read_residuals(survey: Path) -> bytes:
+    """Content of the map beside a survey, empty where there is none; raises `SurveyError`."""
+    path = residuals_beside(survey)
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise SurveyError(f"{path}: cannot be read: {error.strerror}; mend that, or move it away") from error
+
+
+def from_header(header: dict[str, Any], folder: Path | None = None) -> Lights | None:
+    """What a recording was made with; None where it had no photodiode.
+
+    ``folder`` is where its segments lie; without the residual map in it there is none (:func:`lost_residuals`).
+
+    Raises:
+        ValueError: it is not of this version.
+    """
+    kept = header.get(HEADER)
+    if kept is None:
+        return None
+    try:
+        survey = msgspec.convert(kept["survey"], Survey)
+        inside = base64.b64decode(kept.get("residuals", ""), validate=True)  # as recordings were written at first
+        residuals = inside or _kept_residuals(folder, kept.get("residuals_sha256", ""))
+        return Lights(survey, PROFILES[kept["profile"]], kept["clock_ppm"], residuals)
+    except (KeyError, TypeError, ValueError, msgspec.ValidationError) as error:
+        raise ValueError(f"the recording's lights are not of this version ({error})") from error
+
+
+def lost_residuals(header: dict[str, Any], lights: Lights) -> bool:
+    """Whether a recording was made with a residual map that is not there any more, or not as it was."""
+    return bool(header[HEADER].get("residuals_sha256")) and not lights.residuals
+
+
+def _kept_residuals(folder: Path | None, digest: str) -> bytes:
+    """The residual map in a recording's folder, empty where it is not the one with that digest."""
+    if folder is None or not digest:
+        return b""
+    try:
+        content = (folder / RESIDUALS).read_bytes()
+    except OSError:
+        return b""
+    return content if _digest(content) == digest else b""
+
+
+def _digest(residuals: bytes) -> str:
+    return hashlib.sha256(residuals).hexdigest() if residuals else ""

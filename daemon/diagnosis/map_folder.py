@@ -1,0 +1,92 @@
+"""What a folder of maps is good for; nothing in it is touched."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from enum import Enum, auto
+from pathlib import Path
+from typing import Final
+
+from daemon.config.paths import can_be_made, maps_folder
+from daemon.config.schema import Config
+
+LOCKS: Final = Path("/proc/locks")
+
+
+class Maps(Enum):
+    """What a folder of maps is good for."""
+
+    READY = auto()
+    EMPTY = auto()
+    FROZEN = auto()
+    TAKEN = auto()
+    BROKEN = auto()
+
+
+def look_at_maps(settings: Config) -> tuple[Maps, str]:
+    """What the folder of maps is good for, and one line about it; nothing in it is touched.
+
+    READY: there is a map to begin with. EMPTY: there is none yet, and maps can be kept. FROZEN: there is one, and what
+    is learned cannot be kept, as it should be. TAKEN: the same for as long as another process keeps its maps there; it
+    may be the very daemon that the configuration is of. BROKEN: there is none that can be used, or none can be kept.
+    What cannot be used is said, each file by itself, by the store's own log. A folder is often another user's.
+    """
+    folder = maps_folder(settings.map.folder)
+    if not os.access(folder, os.F_OK):
+        if not can_be_made(folder):
+            text = f"{folder}: cannot be made by this user, maps cannot be kept; name another in `map.folder`"
+            return Maps.BROKEN, text
+        return Maps.EMPTY, f"{folder}: not there yet, maps will be kept in it"
+    if not folder.is_dir():
+        return Maps.BROKEN, f"{folder}: is no folder, maps cannot be kept; name another in `map.folder`"
+    if not os.access(folder, os.R_OK | os.X_OK):
+        return Maps.BROKEN, f"{folder}: maps in it cannot be read by this user"
+    from daemon.config.survey_loader import SurveyError  # with it comes numpy, which no other remark needs
+    from daemon.devices.light_setup import load_lights
+    from daemon.maps.store import LOCK, Store, judge_for, unjudged
+
+    store = Store(folder, mend=False)
+    try:
+        judge = judge_for(load_lights(settings))
+    except SurveyError:  # which is told by itself
+        judge = unjudged
+    start = store.load(judge)
+    unwritten = not settings.map.localise and not _writable(folder, folder / LOCK)
+    other = "" if settings.map.localise else _keeper(folder / LOCK)
+    more = "; nothing can be kept in it by this user (fault 403)" if unwritten else ""
+    more += f"; {other} keeps its maps there, and no other can (fault 403)" if other else ""
+    if start is None:
+        broken = store.refused or unwritten
+        text = f"{folder}: {'no map in it can be used' if store.refused else 'no map in it yet'}{more}"
+        return Maps.BROKEN if broken else Maps.TAKEN if other else Maps.EMPTY, text
+    meta, count = start.stored.meta, len(start.stored.tables["submap.key"])
+    named = f" ({meta.name})" if meta.name else ""
+    text = f"{folder}: map {meta.map_id:08x}{named} of {count} submaps is good{more}"
+    return Maps.FROZEN if unwritten else Maps.TAKEN if other else Maps.READY, text
+
+
+def _writable(folder: Path, lock: Path) -> bool:
+    """Whether this user may keep maps in a folder: write into it, and take the lock that is there."""
+    return os.access(folder, os.W_OK | os.X_OK) and (not lock.exists() or os.access(lock, os.R_OK | os.W_OK))
+
+
+def _keeper(lock: Path) -> str:
+    """Who holds the lock of a folder of maps, in words; empty: nobody."""
+    try:
+        with lock.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # and back at once: who starts meanwhile tries again
+    except BlockingIOError:
+        about = lock.stat()
+        named = f"{os.major(about.st_dev):02x}:{os.minor(about.st_dev):02x}:{about.st_ino}"
+    except OSError:
+        return ""
+    else:
+        return ""
+    with contextlib.suppress(OSError):
+        for line in LOCKS.read_text().splitlines():
+            words = line.split()  # 3: FLOCK  ADVISORY  WRITE 1234 08:01:5678 0 EOF
+            if "FLOCK" in words and words[-3] == named:
+                return f"process {words[-4]}"
+    return "another process"  # of a container of its own, or on a file system that has other numbers here

@@ -1,0 +1,231 @@
+"""Recordings and dumps by the time that they cover, and the one that holds a moment that a person names."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any, Final
+
+from daemon.diagnosis import moment
+from daemon.diagnosis import utc as diagnosis_utc
+from daemon.replay.sources import RecordingSource
+from daemon.system import console
+from daemon.system.versions import made_elsewhere
+from hal.errors import DataInvalid, DeviceMissing
+from hal.replay.recording import SUFFIX, Recording, open_recording
+from hal.replay.report import LogReport
+from hal.replay.text import unreadable
+
+BEFORE_S, AFTER_S = 20.0, 5.0
+"""How much around the moment is looked at."""
+UNIX_S: Final = 1e8
+"""A number of seconds beyond is since the Unix epoch, else since the recording began."""
+DIGITS: Final = 6
+"""Of a second's fraction, beyond which times are not told apart."""
+
+
+class NoMoment(Exception):
+    """There is no such moment in what was recorded; the text says what there is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A recording, or the part of one in which the clock was not set, and the time (UTC, s) that it covers.
+
+    Attributes:
+        utc_at_zero: of its monotonic clock, s. made: with what, where that is not what runs now; empty otherwise.
+        before_s: how much of the recording is before it, s.
+        came, gone: how far the clock was set where it begins and ends, s; 0: it was not.
+    """
+
+    path: Path
+    begin: float
+    end: float
+    utc_at_zero: float
+    made: str = ""
+    before_s: float = 0.0
+    came: float = 0.0
+    gone: float = 0.0
+
+    @property
+    def remarks(self) -> str:
+        """Lines to say before anything is told of it; may be empty."""
+        clock = diagnosis_utc.said(self.begin, self.came, self.end, self.gone)
+        return "\n".join([*([self.made] if self.made else []), *clock])
+
+
+def spans(folder: Path) -> list[Span]:
+    """The recordings and dumps in a folder, or the one that it is; in parts where the clock was set, in their order.
+
+    Raises:
+        HalError: it cannot be read, or there is none.
+    """
+    try:
+        if not (is_folder(folder) or folder.exists()):
+            raise DeviceMissing(str(folder), "no such folder", "name a recording, a dump, or a folder of several")
+        inside = sorted(path for path in folder.iterdir() if path.is_dir()) if is_folder(folder) else []
+    except OSError as error:
+        raise unreadable(folder, error) from error
+    runs = [path for path in inside if any(path.glob(f"*{SUFFIX}"))] or [folder]
+    found = []
+    for path in runs:
+        try:
+            found += _spans(path)
+        except (DataInvalid, DeviceMissing) as error:  # a ring that is being written loses segments meanwhile
+            if len(runs) == 1:
+                raise
+            console.say(f"{error}: passed over")
+    return found
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder; raises `HalError` where that may not be known, as of the service's own folder."""
+    try:
+        return path.is_dir()
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def _spans(path: Path) -> list[Span]:
+    recording = open_recording(path)
+    source = RecordingSource(path)
+    begun = _begun(path, recording.header)
+    begin = begun[0] if source.begin is None else source.begin.t_mono
+    end = max(begin, _end(recording, begin))
+    parts = [part for part in diagnosis_utc.parts(path, source.files, begun, begin) if part.t_mono <= end]
+    ends = [*(part.t_mono for part in parts[1:]), end]
+    steps = [*(part.step for part in parts[1:]), 0.0]
+    made = made_elsewhere(recording.header)
+    return [
+        Span(
+            path,
+            begin=round(part.utc_at_zero + part.t_mono, 6),
+            end=round(part.utc_at_zero + until, 6),
+            utc_at_zero=part.utc_at_zero,
+            made=made,
+            before_s=part.t_mono - begin,
+            came=part.step,
+            gone=gone,
+        )
+        for part, until, gone in zip(parts, ends, steps, strict=True)
+    ]
+
+
+def _end(recording: Recording, begin: float) -> float:
+    """When the last record was made, s; a kill or a power cut may leave a segment without any, or without a head."""
+    for segment in reversed(recording.segments):
+        last = replace(recording, segments=(segment,)).frames(LogReport())
+        if (end := max((frame.t_mono for frame in last), default=None)) is not None:
+            return end
+    return begin
+
+
+def _begun(path: Path, header: dict[str, Any]) -> diagnosis_utc.Pair:
+    """When a run began, s, by its monotonic clock and in UTC."""
+    if not {"t_mono", "t_utc"} <= header.keys():
+        problem = "its head does not say when it began, so no moment can be found in it"
+        raise DataInvalid(str(path), problem, "replay it as a whole: lumiloop replay")
+    if (pair := diagnosis_utc.pair_of(header["t_mono"], header["t_utc"])) is None:
+        raise DataInvalid(str(path), "its head says no time that can be", "replay it as a whole: lumiloop replay")
+    return pair
+
+
+def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, float]:
+    """The recording that holds a moment, and when that is.
+
+    Returns:
+        The recording with most of the time before it; the moment (UTC), to the microsecond; and how long it lasts, s,
+        more than 0. Of a whole second a part may be recorded: then it is that part. Where a clock was set back, a time
+        came twice in a recording: the later is taken.
+
+    Raises:
+        NoMoment: none does, or that is no time.
+    """
+    wide = width(words)
+    asked = [(span, round(utc, 6), round(utc + wide, 6)) for span in recorded for utc in meant(words, span)]
+    here = [
+        (span, begin, round(end - begin, 6), begin == utc)
+        for span, utc, end in asked
+        if utc <= span.end and (begin := max(utc, span.begin)) < end
+    ]
+    if here:
+        # Of the parts of one recording that which holds the time's begin, and of several the latest.
+        part = {one[0].path: one[0] for one in sorted(here, key=lambda one: one[3])}
+        there = [one for one in here if one[0] is part[one[0].path]]
+        return max(there, key=_has_before)[:3]
+    raise NoMoment(f"{words}: not in what is recorded in {folder}; there is\n" + "\n".join(map(_listed, recorded)))
+
+
+def _has_before(found: tuple[Span, float, float, bool]) -> tuple[float, float]:
+    """By what a recording is chosen: how much it holds before a moment, and then the latest."""
+    span, begin, *_ = found
+    return min(begin - span.begin + span.before_s, BEFORE_S), span.begin - span.before_s
+
+
+def _listed(span: Span) -> str:
+    """A line that says what is recorded."""
+    came = f", after the clock was set by {span.came:+.3f} s" if span.came else ""
+    begin, end = moment.clock(span.begin), moment.clock(span.end)
+    return f"  {begin} to {end}, {span.end - span.begin:.0f} s  {span.path.name}{came}"
+
+
+def whole_second(words: str) -> bool:
+    """Whether no fraction is named: then all that came in that second is meant, as where the journal says the time."""
+    return not re.search("[.,]", words)
+
+
+def width(words: str) -> float:
+    """Seconds that a time stands for: one of its fraction's last digit; 1 without one, for a minute or a date, too.
+
+    So does a time that was printed, and cut, mean its cycle.
+    """
+    fraction = re.search("[.,]([0-9]+)", words)
+    return moment.SECOND_S * 10.0 ** -min(0 if fraction is None else len(fraction[1]), DIGITS)
+
+
+def meant(words: str, span: Span) -> list[float]:
+    """The instants (UTC) that somebody may mean.
+
+    A time of the day, on the days that the recording covers; a date with a time; local time, of which the night has one
+    hour twice when the clocks are put back, unless it ends with Z or an offset. Or a number: of seconds since the
+    recording began, or since the Unix epoch.
+
+    Raises:
+        NoMoment: it is no time.
+    """
+    text = words.strip().replace(",", ".")  # as half of the world writes a fraction, and ISO 8601 too
+    if re.fullmatch(r"[0-9]+(\.[0-9]+)?", text):
+        number = float(text)
+        return [number if number > UNIX_S else span.begin - span.before_s + number]
+    try:
+        if told := re.fullmatch(r"(\d{1,2}:\d\d(?::\d\d(?:\.\d+)?)?)(Z|[+-]\d\d:?\d\d)?", text):
+            of_day, offset = told.groups()
+            zone = None if offset is None else datetime.strptime(offset, "%z").tzinfo
+            first, last = (datetime.fromtimestamp(utc, zone) for utc in (span.begin, span.end))
+            midnight = first.replace(hour=0, minute=0, second=0, microsecond=0, fold=0)
+            days = [midnight + timedelta(days=day) for day in range((last.date() - first.date()).days + 1)]
+            return [utc for day in days for utc in _instants(day + _time_of(of_day))]
+        return _instants(datetime.fromisoformat(text))
+    except (ValueError, OverflowError) as error:
+        raise NoMoment(
+            f"{words}: not a time; write 21:14:07, 2026-11-21T21:14:07Z, or seconds since the beginning"
+        ) from error
+
+
+def _instants(at: datetime) -> list[float]:
+    """The instants (UTC, s) of a date and time: without a zone that of the place, which may have it twice, or never."""
+    if at.tzinfo is not None:
+        return [at.timestamp()]
+    found = (at.replace(fold=fold).astimezone() for fold in (0, 1))
+    utc = dict.fromkeys(local.timestamp() for local in found if local.replace(tzinfo=None, fold=0) == at)
+    return list(utc)
+
+
+def _time_of(text: str) -> timedelta:
+    hours, minutes, *seconds = text.split(":")
+    at = timedelta(hours=int(hours), minutes=int(minutes), seconds=float(seconds[0]) if seconds else 0.0)
+    if int(hours) > 23 or int(minutes) > 59 or at >= timedelta(hours=int(hours), minutes=int(minutes) + 1):
+        raise ValueError(text)
+    return at

@@ -1,0 +1,40 @@
+"""Where keyframes, lamps and cells of a map image lie in the map frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from daemon.maps.grid_files import finest
+from estimator import Array, Grid, Keyframe, MapImage, Submap, at_once, finished, se2
+
+
+def placed(image: MapImage) -> list[tuple[Keyframe, Array]]:
+    """Keyframes with T_map_keyframe, by number."""
+    places = {piece.key: piece.T_map_submap for piece in image.submaps}
+    found = [(hung.frame, se2.compose(places[hung.submap], hung.T_submap_keyframe)) for hung in image.keyframes()]
+    return sorted(found, key=lambda one: one[0].key)
+
+
+def pieces_of(image: MapImage) -> Iterator[tuple[Submap, list[Keyframe]]]:
+    """Submaps, oldest first, with what hangs on each."""
+    hung: dict[int, list[Keyframe]] = {}
+    for one in image.keyframes():
+        hung.setdefault(one.submap, []).append(one.frame)
+    for piece in image.submaps:
+        if piece.key in hung:
+            yield Submap(*piece), hung[piece.key]
+
+
+def grid_of(image: MapImage) -> Grid:
+    """The map at the finest resolution that its extent allows."""
+    return finest(partial(at_once, list(pieces_of(finished(image)))))
+
+
+def lamps_of(image: MapImage) -> Array | None:
+    """(k, 2) places of the lamps; None where the map does not lie in their frame."""
+    if not image.identity.surveyed or not image.lamps:
+        return None
+    return np.array([(lamp.x, lamp.y) for lamp in image.lamps])

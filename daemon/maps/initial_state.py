@@ -1,0 +1,129 @@
+"""The estimator's state at a start: empty or with a stored map, and with the residual map where there is one."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daemon.config.paths import maps_folder
+from daemon.config.schema import MapConfig
+from daemon.devices.light_setup import Lights
+from daemon.maps.container import Damaged
+from daemon.maps.schema import read
+from daemon.maps.store import Start, Store, judge_for
+
+if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+    from estimator import LightsSetup, ResidualMap, Settings, State
+
+log = logging.getLogger(__name__)
+
+
+class CannotBegin(Damaged):
+    """A map that passes every check of its file, and yet the estimator cannot be begun with it."""
+
+    remedy = "it is kept, the generation before it is used; please report it, with the file"
+
+
+def new_state(lights: Lights | None, settings: Settings | None = None, start: Start | None = None) -> State:
+    """The estimator's state for a robot just switched on, and the map it begins with; loads the estimator.
+
+    A residual map that cannot be used is named in the log, and the robot drives without.
+
+    Raises:
+        CannotBegin: the map is at fault. ValueError: the survey or the stored sample clock is.
+    """
+    import estimator
+
+    setup = None if lights is None else setup_of(lights)
+    if start is None:
+        return estimator.new_state(settings, setup)
+    from daemon.maps.image import image_from
+    from estimator import restored
+
+    settings = replace(settings or estimator.Settings(), localise=start.localise)
+    try:
+        return restored(image_from(start.stored, start.changed), settings, setup)
+    except Exception as error:  # what no check has foreseen must not end this start, and the next, and the next
+        estimator.new_state(settings, setup)  # what is wrong without a map too is not the map's fault
+        if isinstance(error, MemoryError):
+            raise
+        raise CannotBegin(f"it passes every check, but cannot be made into a state: {error!r}") from error
+
+
+def begun(lights: Lights | None, settings: Settings, start: Start | None) -> State:
+    """The same for a replay: the run that began without a map that it could not be begun with is repeated so."""
+    try:
+        return new_state(lights, settings, start)
+    except CannotBegin as error:
+        log.error("the stored map is not used: %s", error)
+        return new_state(lights, settings)
+
+
+def setup_of(lights: Lights) -> LightsSetup:
+    """The photodiode as the estimator takes it; a residual map that cannot be used is named in the log."""
+    from estimator import LightsSetup
+
+    return LightsSetup(lights.survey, lights.profile, lights.clock_ppm, _learned(lights))
+
+
+def _learned(lights: Lights) -> ResidualMap | None:
+    """The residual map, None where there is none or it is of no use."""
+    if not lights.residuals:
+        return None
+    from daemon.config.residual_file import ResidualError, unpack
+
+    try:
+        residuals = unpack(lights.residuals, lights.survey, "the residual map beside the survey")
+    except ResidualError as error:
+        log.warning("%s; driving without it", error)
+        return None
+    log.info("residual map of %d lamps", len(residuals.lamp_ids))
+    return residuals
+
+
+class NoMap(Exception):
+    """There is no map, and nothing can be done without one; names the folder and the remedy."""
+
+
+def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tuple[Store | None, Start | None]:
+    """The folder of maps and the map that a run begins with, as far as there are such.
+
+    Raises:
+        NoMap: a map is to be used as it is, and there is none that can be.
+    """
+    if not config.kept:
+        return None, None
+    store = Store(maps_folder(config.folder), mend)
+    if mend and not config.localise:
+        store.claim()
+    start = store.load(judge_for(lights))
+    if start is None and config.localise:
+        raise NoMap(
+            f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make "
+            "one, or import one: lumiloop map import"
+        )
+    if start is None and store.refused:
+        log.error("no map in %s can be used; a new one is begun", store.folder)
+    if start is not None:
+        start = replace(start, localise=config.localise)
+        meta = start.stored.meta
+        named = f" ({meta.name})" if meta.name else ""
+        count = len(start.stored.tables["submap.key"])
+        log.info("map %08x%s of %d submaps loaded from %s", meta.map_id, named, count, store.folder)
+    return store, start
+
+
+def recorded_start(path: Path, sha256: str, lights: Lights | None, localise: bool = False) -> Start:
+    """The map in a recording's folder.
+
+    Raises:
+        OSError: it cannot be read. BadMap: it is not the one that the run began with, or not good.
+    """
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise Damaged(f"{path.name} is not the map that the recorded run began with")
+    stored = read(content)
+    return Start(content, stored, judge_for(lights)(stored)[1], localise)

@@ -1,0 +1,40 @@
+"""What the Modbus server has seen, and which clients it may answer."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from daemon.system.logging import Sparing
+
+log = logging.getLogger(__name__)
+
+MAX_CONNECTIONS: Final = 32
+STRANGE: Final = "sends what is no Modbus request; it is dropped, and a connection closed"
+CROWDED: Final = f"is not served: {MAX_CONNECTIONS} connections are open and in use, close one"
+Allowed = Callable[[str], bool]
+
+
+def everyone(_: str) -> bool:
+    """No host is turned away."""
+    return True
+
+
+@dataclass(slots=True)
+class Counts:
+    """What the server has seen; of whom it does not serve the log has a line a minute."""
+
+    requests: int = 0
+    malformed: int = 0
+    unsent: int = 0
+    connections: int = 0
+    refused: int = 0
+    dropped: int = 0
+    lines: dict[str, Sparing] = field(default_factory=dict)
+
+    def tell(self, peer: str, what: str) -> None:
+        """Say of a client what becomes of it."""
+        self.lines.setdefault(what, Sparing(log, 1, 60.0)).say(time.monotonic(), logging.INFO, f"Modbus: {peer} {what}")

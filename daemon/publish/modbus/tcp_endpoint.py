@@ -1,0 +1,222 @@
+"""Modbus over TCP: connections, their share of each turn of the event loop, and when they are closed."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections import deque
+from typing import Final
+
+from daemon.publish.modbus.counts import CROWDED, MAX_CONNECTIONS, STRANGE, Allowed, Counts, everyone
+from daemon.publish.modbus.requests import Responder, frame_size
+from hal.net.fair_share import Share
+
+log = logging.getLogger(__name__)
+
+TCP_WAITING_PER_TURN: Final = 16
+IDLE_S: Final = 60.0  # without a whole request
+PARTIAL_S: Final = 5.0  # a request that is not completed
+STUCK_S: Final = 10.0  # answers that are not read
+EVICT_S: Final = 5.0  # a full house drops the longest idle of those idle for longer
+_SWEEP_S: Final = 1.0
+_WRITE_HIGH: Final = 16 * 1024
+_READ_HIGH: Final = 16 * 1024
+
+
+class Connection(asyncio.Protocol):
+    """One TCP client."""
+
+    def __init__(self, server: TcpEndpoint) -> None:
+        self._server = server
+        self._loop = asyncio.get_running_loop()
+        self._transport: asyncio.Transport | None = None
+        self._buffer = bytearray()
+        self._blocked_since: float | None = None
+        self._heard = self._loop.time()
+        self._ended = False
+        self.last_request = self._loop.time()
+        self.waiting = False
+        self.peer = ""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """asyncio: a client has connected."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.set_write_buffer_limits(high=_WRITE_HIGH)
+        peer = transport.get_extra_info("peername")
+        self.peer = "" if peer is None else str(peer[0])
+        if peer is not None and not self._server.allowed(peer[0]):
+            transport.abort()
+            return
+        self._server.admit(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """asyncio: the client has gone, or we have closed."""
+        self._transport = None
+        self._buffer.clear()
+        self._server.forget(self)
+
+    def data_received(self, data: bytes) -> None:
+        """asyncio: bytes have arrived."""
+        self._buffer += data
+        self._heard = self._loop.time()
+        share, transport = self._server.share, self._transport
+        if share.begin():
+            try:
+                if not self.waiting and self.serve(1):
+                    self._server.wait(self)
+                elif len(self._buffer) > _READ_HIGH and transport is not None:
+                    transport.pause_reading()
+            finally:
+                share.end()
+        elif transport is not None:
+            transport.pause_reading()
+            if not self.waiting:
+                self._server.wait(self)
+
+    def eof_received(self) -> bool:
+        """asyncio: the client sends no more; it gets the answers it is owed, then the connection closes."""
+        self._ended = True
+        if not self.waiting:
+            self._server.wait(self)
+        return True
+
+    def pause_writing(self) -> None:
+        """asyncio: answers pile up unread."""
+        self._blocked_since = self._loop.time()
+
+    def resume_writing(self) -> None:
+        """asyncio: answers are read again."""
+        self._blocked_since = None
+        if not self.waiting:
+            self._server.wait(self)
+
+    def serve(self, most: int) -> bool:
+        """Answer up to `most` requests; returns whether more can be answered at once."""
+        transport, size = self._transport, 0
+        if transport is None or self._blocked_since is not None:
+            return False
+        answers: list[bytes] = []
+        while len(answers) < most and 0 < (size := frame_size(self._buffer)) <= len(self._buffer):
+            answers.append(self._server.responder.answer(bytes(self._buffer[:size])))
+            del self._buffer[:size]
+        if answers:
+            self._server.counts.requests += len(answers)
+            self.last_request = self._loop.time()
+            transport.write(b"".join(answers))
+        size = frame_size(self._buffer)
+        more = 0 < size <= len(self._buffer)
+        if size < 0 or (self._ended and not more):
+            if size < 0:
+                self._server.counts.malformed += 1
+                self._server.counts.tell(self.peer, STRANGE)
+            transport.close()
+        elif len(self._buffer) <= _READ_HIGH and not transport.is_reading():
+            transport.resume_reading()
+        return more
+
+    def overdue(self, now: float) -> bool:
+        """Whether this client has used up our patience."""
+        if self._blocked_since is not None:
+            return now - self._blocked_since > STUCK_S
+        return now - self.last_request > IDLE_S or (bool(self._buffer) and now - self._heard > PARTIAL_S)
+
+    def abort(self) -> None:
+        """Close at once."""
+        if self._transport is not None:
+            self._transport.abort()
+
+
+class TcpEndpoint:
+    """Serves listening sockets and shares each turn fairly among their connections."""
+
+    def __init__(
+        self, responder: Responder, counts: Counts, allowed: Allowed = everyone, share: Share | None = None
+    ) -> None:
+        self.allowed = allowed
+        self.share = share or Share()
+        self.responder = responder
+        self.counts = counts
+        self._loop = asyncio.get_running_loop()
+        self._connections: dict[Connection, None] = {}
+        self._waiting: deque[Connection] = deque()
+        self._servers: list[asyncio.Server] = []
+        self._again: asyncio.TimerHandle | None = None
+        self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
+
+    async def listen(self, sock: socket.socket) -> None:
+        """Accept connections on a bound socket."""
+        server = await self._loop.create_server(lambda: Connection(self), sock=sock, backlog=MAX_CONNECTIONS)
+        self._servers.append(server)
+
+    async def close(self) -> None:
+        """Stop accepting and drop every connection."""
+        self._sweeper.cancel()
+        if self._again is not None:
+            self._again.cancel()
+        for server in self._servers:
+            server.close()
+        for connection in list(self._connections):
+            connection.abort()
+        for server in self._servers:
+            await server.wait_closed()
+
+    def admit(self, connection: Connection) -> None:
+        """Take a new connection; a full house first drops its longest idle one, and else refuses the new one."""
+        if len(self._connections) >= MAX_CONNECTIONS:
+            oldest = min(self._connections, key=lambda c: c.last_request)
+            if self._loop.time() - oldest.last_request <= EVICT_S:
+                self.counts.refused += 1
+                self.counts.tell(connection.peer, CROWDED)
+                connection.abort()
+                return
+            self.counts.dropped += 1
+            oldest.abort()
+            self.forget(oldest)
+        self._connections[connection] = None
+        self.counts.connections = len(self._connections)
+
+    def forget(self, connection: Connection) -> None:
+        """A connection is gone."""
+        self._connections.pop(connection, None)
+        self.counts.connections = len(self._connections)
+
+    def wait(self, connection: Connection) -> None:
+        """Queue a connection that has more requests than its turn allows."""
+        connection.waiting = True
+        self._waiting.append(connection)
+        if len(self._waiting) == 1:
+            self._loop.call_soon(self._serve_waiting)
+
+    def _serve_waiting(self) -> None:
+        """Round robin, each its part of the turn's share."""
+        if not self.share.begin():
+            self._again = self.share.later(self._serve_waiting)
+            return
+        self._again = None
+        connections = min(len(self._waiting), TCP_WAITING_PER_TURN)
+        for _ in range(connections):
+            connection = self._waiting.popleft()
+            connection.waiting = self._served(connection, TCP_WAITING_PER_TURN // connections)
+            if connection.waiting:
+                self._waiting.append(connection)
+        if self._waiting:
+            self._loop.call_soon(self._serve_waiting)
+        self.share.end()
+
+    def _served(self, connection: Connection, most: int) -> bool:
+        """As :meth:`Connection.serve`; one that cannot be served is closed, and the others still have their turn."""
+        try:
+            return connection.serve(most)
+        except Exception:
+            log.exception("a Modbus client cannot be served; it is disconnected")
+            connection.abort()
+            return False
+
+    def _sweep(self) -> None:
+        now = self._loop.time()
+        for connection in [c for c in self._connections if c.overdue(now)]:
+            self.counts.dropped += 1
+            connection.abort()
+        self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)

@@ -1,0 +1,146 @@
+"""Client of the daemon's local stream: connects, subscribes to topics, and reconnects after a loss.
+
+async for frame in Stream(path, ("pose", "scan")).frames():
+    match frame:
+        case Hello(): ...       # connected, or connected again
+        case Lost(): ...        # the daemon has gone; frames go on when it is back
+        case Pose(): ...
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from daemon.config.paths import SERVICE, daemons_in, stream_path
+from daemon.publish.stream import messages
+from daemon.publish.stream.messages import LONGEST, Frame, NotTheStream, Refused
+from daemon.publish.stream.server import TOPICS
+
+FIRST_RETRY_S: Final = 0.2
+LAST_RETRY_S: Final = 2.0
+SILENT_S: Final = 10.0
+"""Without a greeting for so long: the daemon stands, or the path leads to another program."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """There is no connection; ``text`` says why. Told once, not at each try."""
+
+    text: str
+
+
+class Stream:
+    """What a daemon tells, for as long as somebody asks.
+
+    Args:
+        path: of the socket; or the name of a daemon, whose socket is looked for at each try.
+        topics: that are wanted.
+        patient: whether to go on trying after a loss, and when nobody is there at first.
+
+    Raises:
+        ValueError: no such topic.
+    """
+
+    def __init__(self, path: Path | str, topics: Sequence[str], patient: bool = True) -> None:
+        if unknown := sorted(set(topics) - set(TOPICS)):
+            raise ValueError(f"no such topic: {', '.join(unknown)}; there are {', '.join(TOPICS)}")
+        self._of, self.topics, self.patient = path, tuple(topics), patient
+
+    @property
+    def path(self) -> Path:
+        """Of the socket, as far as is known now."""
+        return stream_path(self._of) if isinstance(self._of, str) else self._of
+
+    async def frames(self) -> AsyncGenerator[Frame | Lost, None]:
+        """Every frame, from the greeting on; ends after :class:`Lost` where it is not patient. To be closed.
+
+        Raises:
+            NotTheStream: what comes cannot be read, or our request was refused; trying again would not help.
+        """
+        retry, told = FIRST_RETRY_S, False
+        while True:
+            path = self.path
+            try:
+                async with _connected(path) as (reader, writer):
+                    writer.write(messages.request(self.topics))
+                    async with contextlib.aclosing(_frames(reader)) as heard:
+                        async for frame in heard:
+                            retry, told = FIRST_RETRY_S, False
+                            yield frame
+                    lost = f"{path}: the daemon has closed the stream"
+            except OSError as error:
+                lost = f"{path}: {_why(error)}"
+                if not told and _nobody(error):
+                    lost += _others(path)
+            if not told:
+                told = True
+                yield Lost(lost)
+            if not self.patient:
+                return
+            await asyncio.sleep(retry)
+            retry = min(2.0 * retry, LAST_RETRY_S)
+
+
+@contextlib.asynccontextmanager
+async def _connected(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    reader, writer = await asyncio.open_unix_connection(str(path), limit=1 << 20)
+    try:
+        sock: socket.socket | None = writer.get_extra_info("socket")
+        if sock is not None:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        yield reader, writer
+    finally:
+        writer.transport.abort()  # nothing of ours is worth waiting for
+
+
+async def _frames(reader: asyncio.StreamReader) -> AsyncGenerator[Frame, None]:
+    """Frames until the daemon closes; what this version does not know is left out."""
+    greeted = False
+    while (body := await _body(reader, None if greeted else SILENT_S)) is not None:
+        frame = messages.decode(body)
+        if not greeted and not isinstance(frame, (messages.Hello, Refused)):
+            raise NotTheStream("who answers does not greet; is this the stream of a lumiloop?")
+        greeted = True
+        if isinstance(frame, Refused):
+            raise NotTheStream(f"the daemon refuses: {frame.text}")
+        if frame is not None:
+            yield frame
+
+
+async def _body(reader: asyncio.StreamReader, patience_s: float | None) -> bytes | None:
+    """The next frame without its length; None: closed, also in the middle of one."""
+    try:
+        async with asyncio.timeout(patience_s):
+            length = int.from_bytes(await reader.readexactly(4), "little")
+            if length > LONGEST:
+                raise NotTheStream(f"a frame of {length} bytes; is this the stream of a lumiloop?")
+            return await reader.readexactly(length)
+    except asyncio.IncompleteReadError:
+        return None
+    except TimeoutError:
+        raise OSError(f"nothing is said for {SILENT_S:.0f} s: the daemon stands") from None
+
+
+def _nobody(error: OSError) -> bool:
+    return isinstance(error, (FileNotFoundError, ConnectionRefusedError))
+
+
+def _others(path: Path) -> str:
+    """Daemons that may be meant: who forgets `--config` asks for the one of the default name."""
+    names = sorted({name for folder in {path.parent, SERVICE} for name in daemons_in(folder)} - {path.stem})
+    runs = "runs" if len(names) == 1 else "run"
+    return f"; {', '.join(names)} {runs} here: `--set name={names[0]}`, or `--config`" if names else ""
+
+
+def _why(error: OSError) -> str:
+    if _nobody(error):
+        return "nobody listens there; is the daemon running? its log names its stream"
+    if isinstance(error, PermissionError):
+        return "you may not open it; who may reach its folder may listen"
+    return error.strerror or str(error)

@@ -1,0 +1,266 @@
+"""The local stream: one unix socket from which every tap (web page, converter, logger) takes what it wants.
+
+Frames are a little-endian length and that many bytes of msgpack, a map with at least ``topic``. A client says once what
+it wants. What is the latest of its kind replaces what a slow client has not taken yet (and is counted); what happens
+once (a loop, a change of state) is kept for it, up to a bound. Nothing here waits for a client, and without clients
+nothing is encoded: a tap that hangs costs the daemon a buffer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import socket
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from daemon.maps.tiles import NOTHING_SHOWN, RESOLUTION_M, MapTiles
+from daemon.publish.stream.session import CLIENTS, LATEST, ONCE, RAW, SCHEMA, TOPICS, Client, encode, framed
+from daemon.snapshot import Snapshot
+from hal.adc import RawSamples
+from hal.errors import DeviceRefused
+from hal.lidar import VALID, RawScan
+from hal.net.fair_share import Share
+
+__all__ = [
+    "LATEST",
+    "ONCE",
+    "RAW",
+    "SCHEMA",
+    "SIDE",
+    "TOPICS",
+    "UNIT",
+    "Client",
+    "StreamServer",
+    "framed",
+    "scan_message",
+]
+
+Place = Callable[[int], tuple[float, float, float] | None]
+
+TILE_BYTES: Final = 32 << 10
+"""Of deflated tiles in one frame."""
+SIDE: Final = 128
+UNIT: Final = 0.1
+"""Cells of a tile, each way; log-odds of a cell's unit (`estimator.mapping.grid_patches`, which is not loaded here)."""
+
+
+def scan_message(scan: RawScan) -> dict[str, object]:
+    """A scan in SI units: bearings in rad from the lidar's front axis, counter-clockwise, evenly spaced."""
+    geometry = scan.geometry
+    bearing = geometry.bearings(scan.first_step, scan.stride, 2)
+    none = np.where(scan.code > geometry.dmax, np.inf, np.nan)  # no echo within reach, and what is no distance
+    ranges = np.where(scan.code == VALID, scan.ranges * geometry.range_unit_m, none).astype("<f4")
+    return {
+        "seq": scan.seq,
+        "t_mono": scan.t_mono,
+        "bearing_first": float(bearing[0]),
+        "bearing_step": float(bearing[1] - bearing[0]),
+        "ranges": ranges.tobytes(),
+        "range_min": geometry.dmin * geometry.range_unit_m,
+        "range_max": geometry.dmax * geometry.range_unit_m,
+        "beam_dt": geometry.beam_dt_s * scan.stride,
+        "period": geometry.period_s,
+    }
+
+
+class StreamServer:
+    """Serves the stream at a path in the file system.
+
+    Attributes:
+        clients: that are connected. tiles: of the map; None: there are none. share: of the loop's time, for requests.
+        place: where a keyframe lies in the map, by ID; None: it is not known.
+
+    Args:
+        path: of the socket; its folder is made. name: of the robot.
+        explain: meaning and remedy of a reason's number.
+    """
+
+    def __init__(self, path: Path, name: str, explain: Callable[[int], tuple[str, str]]) -> None:
+        self.path = path
+        self.clients: set[Client] = set()
+        self._name = name
+        self._explain = explain
+        self._latest: Snapshot | None = None
+        self._faults: list[dict[str, object]] = []
+        self.tiles: MapTiles | None = None
+        self.place: Place = _nowhere
+        self.share = Share()
+
+    async def run(self) -> None:
+        """Serve until cancelled.
+
+        Raises:
+            DeviceRefused: another program serves it, or it cannot be made.
+        """
+        try:
+            listening = self._bind()
+        except OSError as error:
+            problem = error.strerror or str(error)
+            remedy = "free the path, or give write access to its folder"
+            raise DeviceRefused(f"stream {self.path}", problem, remedy) from None
+        server = await asyncio.get_running_loop().create_unix_server(lambda: Client(self), sock=listening)
+        try:
+            await asyncio.Event().wait()
+        finally:
+            server.close()
+            for client in list(self.clients):
+                client.drop()
+            self.path.unlink(missing_ok=True)
+
+    def _bind(self) -> socket.socket:
+        """The listening socket; what a dead program has left in its place is removed."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.is_socket():
+            if _alive(self.path):
+                raise DeviceRefused(f"stream {self.path}", "another program serves it", "stop that one")
+            self.path.unlink()
+        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        try:
+            listening.bind(str(self.path))
+            self.path.chmod(0o666)  # it only tells; who may reach the folder may listen
+            listening.listen(CLIENTS)
+        except OSError:
+            listening.close()
+            raise
+        return listening
+
+    def hello(self) -> dict[str, object]:
+        """What a client is told first."""
+        return {"topic": "hello", "schema": SCHEMA, "name": self._name, "pid": os.getpid(), "topics": dict(TOPICS)}
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Tell a snapshot; a sink of the cycle."""
+        before, self._latest = self._latest, snapshot
+        if self.clients:
+            told = self._told(snapshot)
+            self._tell("pose", lambda: {**told, **_fields(snapshot)})
+            self._tell("lights", lambda: {} if snapshot.light is None else _fields(snapshot.light))
+            if before is None or (snapshot.state, snapshot.reason) != (before.state, before.reason):
+                self._tell("state", lambda: _state(snapshot, told))
+            if snapshot.loop_counter != (0 if before is None else before.loop_counter):
+                self._tell("loop", lambda: _loop(snapshot, self.place))
+
+    def _told(self, snapshot: Snapshot) -> dict[str, object]:
+        """The state in words."""
+        meaning, remedy = self._explain(snapshot.reason)
+        return {"state_name": snapshot.state.name, "meaning": meaning, "remedy": remedy}
+
+    def on_scan(self, scan: RawScan) -> None:
+        """Tell a scan."""
+        self._tell("scan", lambda: scan_message(scan))
+
+    def on_raw(self, device: str, kind: str, t_mono: float, data: bytes) -> None:
+        """Tell what has passed through a device's port; ``kind``: rx, tx, open, lost, baud."""
+        self._tell("raw", lambda: {"device": device, "kind": kind, "t_mono": t_mono, "bytes": data})
+
+    def on_samples(self, block: RawSamples) -> None:
+        """Tell a block of the photodiode's samples."""
+        self._tell("raw", lambda: _samples(block))
+
+    def on_faults(self, t_mono: float, faults: Iterable[tuple[int, str, str]]) -> None:
+        """Tell which faults are present (number, meaning, remedy), where they are others than before."""
+        told: list[dict[str, object]] = [{"fault": number, "meaning": m, "remedy": r} for number, m, r in faults]
+        if told != self._faults:
+            self._faults = told
+            self._tell("faults", lambda: {"t_mono": t_mono, "present": told})
+
+    def on_statistics(self, figures: Callable[[], Mapping[str, object]]) -> None:
+        """Tell statistics, if anybody wants them."""
+        self._tell("statistics", figures)
+
+    def on_tiles(self) -> None:
+        """There are new tiles."""
+        for client in [client for client in self.clients if "map" in client.wants]:
+            self.show(client)
+
+    def wanted(self, topic: str) -> bool:
+        """Whether anybody wants it."""
+        return any(topic in client.wants for client in self.clients)
+
+    def welcome(self, client: Client, fresh: frozenset[str]) -> None:
+        """A client wants these from now on: it is told how things stand."""
+        if "state" in fresh and (snapshot := self._latest) is not None:
+            client.tell("state", encode(_state(snapshot, self._told(snapshot))))
+        if "faults" in fresh:
+            client.tell("faults", encode({"t_mono": None, "present": self._faults}))
+        if "map" in fresh:
+            client.shown = NOTHING_SHOWN
+            self.show(client)
+
+    def show(self, client: Client) -> None:
+        """Send the tiles that a client has not seen yet, as far as it takes them."""
+        tiles = [] if self.tiles is None or client.stuck else self.tiles.since(client.shown)
+        while tiles and not client.stuck:
+            size = count = 0
+            while count < len(tiles) and size < TILE_BYTES:
+                size += len(tiles[count][1])
+                count += 1
+            now, tiles = tiles[:count], tiles[count:]
+            client.shown = now[-1][0]
+            message = {
+                "map_id": 0 if self._latest is None else self._latest.map_id,
+                "resolution": RESOLUTION_M,
+                "side": SIDE,
+                "unit": UNIT,
+                "version": client.shown[0],
+                "more": bool(tiles),
+                "tiles": [[*tile, cells] for (_, tile), cells in now],
+            }
+            client.tell("map", encode(message))
+
+    def _tell(self, topic: str, data: Callable[[], Mapping[str, object]]) -> None:
+        """Encode once for all that want it."""
+        wanting = [client for client in self.clients if topic in client.wants]
+        if wanting:
+            body = encode(data())
+            for client in wanting:
+                client.tell(topic, body)
+
+
+def _alive(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as sock:
+        return sock.connect_ex(str(path)) in (0, errno.EAGAIN)  # again: it is there, and has many waiting
+
+
+def _fields(record: object) -> dict[str, Any]:
+    built = msgspec.to_builtins(record)
+    assert isinstance(built, dict)
+    return built
+
+
+def _samples(block: RawSamples) -> dict[str, object]:
+    return {
+        "device": "photodiode",
+        "kind": "samples",
+        "t_mono": block.t_first,
+        "rate": block.rate_hz,
+        "bits": block.bits,
+        "bytes": block.words.astype("<u2").tobytes(),
+    }
+
+
+def _nowhere(keyframe: int) -> None:
+    return None
+
+
+def _state(snapshot: Snapshot, told: Mapping[str, object]) -> dict[str, object]:
+    return {"t_mono": snapshot.t_mono, "state": snapshot.state, **told}
+
+
+def _loop(snapshot: Snapshot, place: Place) -> dict[str, object]:
+    return {
+        "t_mono": snapshot.t_mono,
+        "counter": snapshot.loop_counter,
+        "keyframe_new": snapshot.loop_new,
+        "keyframe_old": snapshot.loop_old,
+        "reason": snapshot.loop_reason,
+        "residual": snapshot.loop_residual,
+        "at_new": None if snapshot.loop_new is None else place(snapshot.loop_new),
+        "at_old": None if snapshot.loop_old is None else place(snapshot.loop_old),
+    }

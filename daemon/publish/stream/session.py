@@ -1,0 +1,232 @@
+"""Session of one client of the local stream: its topics, its queue, and when it is disconnected.
+
+What is the latest of its kind replaces what a slow one has not taken (and is counted); what happens once is kept for
+it, up to a bound.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from daemon.maps.tiles import NOTHING_SHOWN
+from hal.net.fair_share import Share
+
+log = logging.getLogger(__name__)
+
+SCHEMA: Final = 1
+"""Version of all that follows. A field never changes its meaning under the same number; readers skip unknown ones."""
+
+LATEST: Final = {
+    "pose": "after each cycle: the whole snapshot, with the state in words",
+    "lights": "after each cycle: what lights alone say, with every link",
+    "scan": "each scan: ranges in m as little-endian float32, not a number where there is none",
+    "statistics": "once a second: counters and times of cycle, devices and process",
+}
+"""Topics of which a slow client gets the latest only."""
+ONCE: Final = {
+    "state": "at first and at a change: state and reason, with meaning and remedy",
+    "loop": "a loop closed: counter, both keyframes, residual, reason",
+    "faults": "at first and at a change: all that are present, with meaning and remedy",
+}
+"""Topics of which a client gets every one, up to :data:`KEPT`."""
+RAW: Final = {"raw": "what passes between daemon and devices: bytes of the lidar's port, words of the photodiode"}
+"""As those, up to :data:`RAW_KEPT`."""
+MAP: Final = {"map": "the map as tiles: at first all, then those that have changed"}
+"""A client gets every tile as it is when it comes to it."""
+TOPICS: Final[Mapping[str, str]] = {**LATEST, **ONCE, **RAW, **MAP}
+
+CLIENTS: Final = 32
+KEPT: Final = 64
+RAW_KEPT: Final = 256
+BUFFER_BYTES: Final = 256 << 10
+"""Bytes that may wait in this process for one client, and one frame."""
+LONGEST_REQUEST: Final = 4096
+REQUESTS_PER_TURN: Final = 4
+"""Of one client; each may want the whole map anew."""
+STUCK_S: Final = 60.0
+"""A client that has taken nothing for so long is let go."""
+
+encode: Final = msgspec.msgpack.Encoder().encode
+_request: Final = msgspec.msgpack.Decoder(dict[str, Any]).decode
+
+
+def framed(message: Mapping[str, object]) -> bytes:
+    """One frame."""
+    body = encode(message)
+    return len(body).to_bytes(4, "little") + body
+
+
+class Server(Protocol):
+    """What a tap is told, and by whom."""
+
+    clients: set[Client]
+    share: Share
+
+    def hello(self) -> dict[str, object]:
+        """What it is told first."""
+        ...
+
+    def welcome(self, client: Client, fresh: frozenset[str]) -> None:
+        """It wants these from now on."""
+        ...
+
+    def show(self, client: Client) -> None:
+        """Send the tiles of the map that it has not seen."""
+        ...
+
+
+class Client(asyncio.Protocol):
+    """One tap.
+
+    Attributes:
+        wants: topics. replaced: frames that a newer one has replaced before it took them.
+        shown: the last tile of the map that it was sent.
+    """
+
+    def __init__(self, server: Server) -> None:
+        self.wants: frozenset[str] = frozenset()
+        self.replaced = 0
+        self._server = server
+        self._transport: asyncio.Transport | None = None
+        self._received = bytearray()
+        self._again: asyncio.TimerHandle | None = None
+        self._latest: dict[str, bytes] = {}
+        self._events: deque[tuple[str, bytes]] = deque(maxlen=KEPT)
+        self._raw: deque[tuple[str, bytes]] = deque(maxlen=RAW_KEPT)
+        self.shown = NOTHING_SHOWN
+        self._stuck: asyncio.TimerHandle | None = None
+
+    @property
+    def stuck(self) -> bool:
+        """Whether it does not take what it has asked for at the moment."""
+        return self._stuck is not None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Greet, or say that there are too many."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.set_write_buffer_limits(high=BUFFER_BYTES)
+        if len(self._server.clients) >= CLIENTS:
+            self._refuse(f"{CLIENTS} clients are being served; close one")
+            return
+        self._server.clients.add(self)
+        transport.write(framed(self._server.hello()))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget it."""
+        self._server.clients.discard(self)
+        for timer in (self._stuck, self._again):
+            if timer is not None:
+                timer.cancel()
+
+    def data_received(self, data: bytes) -> None:
+        """Take requests."""
+        self._received += data
+        if self._again is None:
+            self._serve()
+
+    def _serve(self) -> None:
+        """Take a few requests; the others wait for a turn of their own, and nothing more is read until then."""
+        self._again, share, more = None, self._server.share, True
+        if share.begin():
+            try:
+                more = self._serve_some()
+            finally:
+                share.end()
+        if self._transport is None:
+            return
+        if more:
+            self._transport.pause_reading()
+            self._again = share.later(self._serve)
+        else:
+            self._transport.resume_reading()
+
+    def _serve_some(self) -> bool:
+        """Returns whether there are more."""
+        for _ in range(REQUESTS_PER_TURN):
+            if not self._whole():
+                return False
+            end = 4 + int.from_bytes(self._received[:4], "little")
+            body = bytes(self._received[4:end])
+            del self._received[:end]
+            self._ask(body)
+        return self._whole()
+
+    def _whole(self) -> bool:
+        """Whether a whole request is there."""
+        if len(self._received) < 4:
+            return False
+        length = int.from_bytes(self._received[:4], "little")
+        if length > LONGEST_REQUEST:
+            self._refuse(f"a request of {length} bytes; the longest is {LONGEST_REQUEST}")
+            return False
+        return len(self._received) >= 4 + length
+
+    def pause_writing(self) -> None:
+        """It does not take what it has asked for."""
+        self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self._let_go)
+
+    def resume_writing(self) -> None:
+        """It has caught up: it gets what has happened, and the latest of the rest."""
+        if self._stuck is not None:
+            self._stuck.cancel()
+            self._stuck = None
+        waiting = [*self._events, *self._latest.items(), *self._raw]
+        self._events.clear()
+        self._raw.clear()
+        self._latest = {}
+        for topic, body in waiting:
+            self.tell(topic, body)
+        if "map" in self.wants:
+            self._server.show(self)
+
+    def tell(self, topic: str, body: bytes) -> None:
+        """Send, or keep for when it has caught up."""
+        if self._stuck is None and self._transport is not None:
+            head = encode({"topic": topic, "replaced": self.replaced})
+            # a map of three with the data's bytes as they are: encoded once, whoever wants it
+            joined = b"\x83" + head[1:] + b"\xa4data" + body
+            self._transport.write(len(joined).to_bytes(4, "little") + joined)
+        elif topic in ONCE or topic in RAW:
+            kept = self._events if topic in ONCE else self._raw
+            self.replaced += len(kept) == kept.maxlen
+            kept.append((topic, body))
+        else:
+            self.replaced += topic in self._latest
+            self._latest[topic] = body
+
+    def drop(self) -> None:
+        """Close without waiting for it."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    def _ask(self, body: bytes) -> None:
+        try:
+            wanted = _request(body).get("want")
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # a key that is no text; too deep
+            self._refuse(f"a request that is no msgpack map: {error}")
+            return
+        if not isinstance(wanted, list) or not all(isinstance(topic, str) for topic in wanted):
+            self._refuse("a request without `want`, a list of topics")
+        elif unknown := sorted(set(wanted) - set(TOPICS)):
+            self._refuse(f"no such topic: {', '.join(unknown)[:100]}; there are {', '.join(TOPICS)}")
+        else:
+            before, self.wants = self.wants, frozenset(wanted)
+            self._server.welcome(self, self.wants - before)
+
+    def _refuse(self, text: str) -> None:
+        self.wants = frozenset()
+        self._received.clear()
+        if self._transport is not None:
+            self._transport.write(framed({"topic": "error", "text": text}))
+            self._transport.close()
+
+    def _let_go(self) -> None:
+        log.info("a client of the stream has taken nothing for %.0f s and is let go", STUCK_S)
+        self.drop()

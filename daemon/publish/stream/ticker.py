@@ -1,0 +1,97 @@
+"""Messages of the local stream once a second: faults, statistics, tiles of the map."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from daemon.health.faults import FAULTS, Fault
+from daemon.maps.tiles import MapTiles
+from daemon.publish.stream.server import StreamServer
+from daemon.runtime.cycle_facts import CycleFacts
+from daemon.runtime.vitals import process_age_s, resident_mb
+
+if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+    from estimator import State
+
+BEAT_S: Final = 1.0
+
+
+class StreamBeat:
+    """One of the daemon's parts.
+
+    Args:
+        facts: about the cycle. state: of the estimator, None before it is loaded. faults: that are present.
+    """
+
+    def __init__(
+        self,
+        server: StreamServer,
+        facts: Callable[[], CycleFacts],
+        state: Callable[[], State | None],
+        faults: Callable[[], tuple[Fault, ...]],
+    ) -> None:
+        self._server, self._facts, self._faults = server, facts, faults
+        server.place = partial(place_of, state)
+        self.tiles = server.tiles = MapTiles(state, server.on_tiles)
+
+    async def run(self) -> None:
+        """Tell until cancelled."""
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                await asyncio.sleep(BEAT_S)
+                self.beat(loop)
+        finally:
+            self.tiles.close()
+
+    def beat(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Tell once."""
+        server, facts = self._server, self._facts()
+        server.on_faults(facts.t_mono, in_words(self._faults()))
+        server.on_statistics(lambda: figures(facts))
+        if server.wanted("map"):
+            self.tiles.follow(loop)
+        else:
+            self.tiles.forget()
+
+
+def in_words(faults: tuple[Fault, ...]) -> list[tuple[int, str, str]]:
+    """Number, meaning and remedy of each."""
+    return [(int(fault), *FAULTS[fault]) for fault in faults]
+
+
+def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, float, float] | None:
+    """Where a keyframe lies in the map as corrected so far (m, m, rad); None where it is not kept any more."""
+    now = state()
+    frame = None if now is None else now.map.keyframes.get(keyframe)
+    if frame is None:
+        return None
+    x, y, yaw = frame.T_map_keyframe.tolist()
+    return x, y, yaw
+
+
+def figures(facts: CycleFacts) -> dict[str, object]:
+    """Counters since the start, times in s unless said otherwise."""
+    lidar, photodiode = facts.lidar, facts.photodiode
+    return {
+        "t_mono": facts.t_mono,
+        "uptime": process_age_s(),
+        "memory_mb": resident_mb(),
+        "cycles": facts.cycles,
+        "overruns": facts.overruns,
+        "cycle_us": facts.cycle_us,
+        "jobs_failed": facts.jobs_failed,
+        "scan_period": facts.period,
+        "scans": lidar.scans,
+        "scans_missed": lidar.missed,
+        "scans_invalid": lidar.invalid,
+        "scans_dropped": facts.scans_dropped,
+        "resyncs": lidar.resyncs,
+        "reconnects": lidar.reconnects,
+        "blocks": None if photodiode is None else photodiode.blocks,
+        "blocks_lost": None if photodiode is None else photodiode.blocks_lost,
+        "odometry_jumps": facts.odometry_jumps,
+    }

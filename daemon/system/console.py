@@ -1,0 +1,32 @@
+"""What every command prints on stderr, and its exit codes.
+
+Exit codes: 0 done, 1 it failed (the text says what and what to do), 2 wrong usage or configuration, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Final
+
+OK: Final = 0
+FAILED: Final = 1
+USAGE: Final = 2
+INTERRUPTED: Final = 130
+
+
+def fail(message: str, code: int = FAILED) -> int:
+    """Print on stderr what went wrong and return the exit code."""
+    sys.stderr.write(f"lumiloop: {message}\n")
+    return code
+
+
+def progress(text: str) -> None:
+    """One line on stderr: overwritten on a terminal, one below the other elsewhere."""
+    sys.stderr.write(f"\r\x1b[K{text}" if sys.stderr.isatty() else f"{text}\n")
+    sys.stderr.flush()
+
+
+def say(text: str) -> None:
+    """Print one line on stderr, at once."""
+    sys.stderr.write(f"lumiloop: {text}\n")
+    sys.stderr.flush()

@@ -1,0 +1,1 @@
+"""What carries the bytes of the fake lidar: a pseudo-terminal, a TCP server, a memory port."""

@@ -1,0 +1,1 @@
+"""A live Foxglove server of the stream's ROS 2 messages."""

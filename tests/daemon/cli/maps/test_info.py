@@ -1,0 +1,58 @@
+"""``lumiloop map info`` and ``map verify``: what they say, and that they load no compiler."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from daemon.cli import parser
+from daemon.system import console
+from tests.daemon.support.map_maker import Shape, content
+
+ROOT = Path(__file__).parents[4]
+
+
+def test_info_says_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.lumimap"
+    path.write_bytes(content(Shape(lit=True, submaps=7, loose=1)))
+    assert parser.main(["map", "info", str(path)]) == console.OK
+    said = capsys.readouterr().out
+    for words in ("map id            00001234", "second floor, Süd", "the light survey's", "2017-07-14 02:40:00 UTC"):
+        assert words in said
+    assert parser.main(["map", "info", str(path), "--json"]) == console.OK
+    found = json.loads(capsys.readouterr().out)
+    assert (found["submaps"], found["isolated_submaps"], found["lamps"]) == (6, 1, 6)
+    assert found["bytes"] == path.stat().st_size
+
+
+def test_verify_says_of_each_file_whether_it_is_good(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, bad, torn = (tmp_path / f"{name}.lumimap" for name in ("good", "bad", "torn"))
+    good.write_bytes(content())
+    bad.write_bytes(content()[:-1])
+    torn.write_bytes(content(Shape(submaps=8, loose=2)))
+    assert parser.main(["map", "verify", str(good), str(torn)]) == console.OK
+    said = capsys.readouterr().out
+    assert f"{good}: good, map 00001234\n" in said
+    assert "2 submaps joined with the rest by nothing" in said
+    assert parser.main(["map", "verify", str(good), str(bad), str(tmp_path / "none")]) == console.FAILED
+    said = capsys.readouterr().err
+    assert f"{bad}: it is" in said
+    assert "cut off" in said
+    assert "none: cannot be read: No such file or directory" in said
+    assert parser.main(["map", "info", str(bad)]) == console.FAILED
+
+
+def test_no_compiler_is_loaded_for_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.lumimap"
+    path.write_bytes(content())
+    code = (
+        "import sys; from daemon.cli import parser\n"
+        f"assert parser.main(['map', 'info', {str(path)!r}]) == 0\n"
+        f"assert parser.main(['map', 'verify', {str(path)!r}]) == 0\n"
+        "assert not {'numba', 'llvmlite', 'scipy'} & set(sys.modules), 'a compiler was loaded'"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=60.0)
