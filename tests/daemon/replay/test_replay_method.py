@@ -13,7 +13,7 @@ from daemon.cli import parser
 from estimator.paper import METHODS
 from tests.daemon.cli.test_replay import RESULTS
 from tests.daemon.replay.room import Drive, carmen, drive, read_tum, relative
-from tests.daemon.teachrun import record
+from tests.daemon.commissioning.recorded_drive import record
 from tools.sim.scene import SimulatedScene
 
 SECONDS = 16.0
