@@ -29,6 +29,7 @@ from daemon.replay.log_replay import Outcome, replay
 from daemon.replay.sources import open_log
 from estimator.measurements import Array, Scan
 from estimator.numerics import se2
+from estimator.paper import LUMILOOP
 from estimator.scan_matching.deskew import points_of
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
@@ -93,13 +94,13 @@ def run() -> list[Figure]:
     return figures
 
 
-def load(source: Path) -> Drive:
-    """Convert a log, replay it, and keep what both ways need."""
+def load(source: Path, method: str = LUMILOOP) -> Drive:
+    """Convert a log, replay it by a method, and keep what both ways need."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "scans.log"
         if convert.main([str(source), str(log)]) != 0:
             raise RuntimeError(f"{source} could not be converted")
-        outcome = replay(log, Config())
+        outcome = replay(log, Config(), method=method)
         return drive_of(outcome, log)
 
 

@@ -26,7 +26,7 @@ from tools.experiments.report import COMMAND, Report, Skipped, Work, code, save
 
 EXPERIMENTS: Final = {
     "table1": "Table 1", "fig4": "Fig. 4", "fig5": "Fig. 5", "fig5_loops": "Fig. 5, loops closed", "fig6": "Fig. 6",
-    "claim": "its claim of cost", "adaptive": "its future work", "beamquality": "Eq. 8 and 9",
+    "methods": "Sect. 5", "claim": "its claim of cost", "adaptive": "its future work", "beamquality": "Eq. 8 and 9",
     "room": "", "corridor": "", "doors": "", "islands": "", "tones": "", "static": "", "walks": "", "survey": "",
     "relocate": "", "relocate_real": "", "integrity": "",
 }  # fmt: skip
