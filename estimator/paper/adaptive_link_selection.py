@@ -15,7 +15,7 @@ import numpy as np
 
 from estimator.light_filter.survey import Survey
 from estimator.numerics.arrays import Array
-from estimator.paper.lateration_model import Links, Method, expected_error, spread
+from estimator.paper.lateration_model import Links, SolverSettings, expected_error, spread
 from estimator.paper.lateration_solvers import DECIDED, SAME_M, Solution, Strengths, distinct, starts
 
 SEEDS: Final = 5
@@ -28,16 +28,16 @@ RIVALS: Final = 3
 """Places that are carried along while they all fit."""
 
 
-def adapted(links: Links, survey: Survey, method: Method) -> list[int]:
+def adapted(links: Links, survey: Survey, settings: SolverSettings) -> list[int]:
     """Which of ``links`` (shortest first) to use, in that order; all of them where there are fewer than four."""
     if len(links.d) <= 3:
         return list(range(len(links.d)))
-    agreeing, place = consistent(links, survey, method)
-    most = len(agreeing) if method.link_n is None else min(len(agreeing), method.link_n)
+    agreeing, place = consistent(links, survey, settings)
+    most = len(agreeing) if settings.link_n is None else min(len(agreeing), settings.link_n)
     if place is None or most <= 3:
         return agreeing[:most]
     errors = [
-        float(np.trace(expected_error(links.pick(agreeing[:n]), survey, method, place))) for n in range(3, most + 1)
+        float(np.trace(expected_error(links.pick(agreeing[:n]), survey, settings, place))) for n in range(3, most + 1)
     ]
     return agreeing[: 3 + int(np.argmin(errors))]
 
@@ -51,13 +51,13 @@ class Agreement:
     score: float
 
 
-def consistent(links: Links, survey: Survey, method: Method) -> tuple[list[int], Array | None]:
+def consistent(links: Links, survey: Survey, settings: SolverSettings) -> tuple[list[int], Array | None]:
     """The set of links that explains most, shortest first, and the place (x, y) it gives (None: no triple fits)."""
     best: Agreement | None = None
     for triple in combinations(range(min(SEEDS, len(links.d))), 3):
         if spread(links.pick(triple).xy)[0] < SAME_M:
             continue
-        grown = _grown(links, survey, method, list(triple))
+        grown = _grown(links, survey, settings, list(triple))
         if grown is not None and (best is None or grown.score < best.score):
             best = grown
         if best is not None and best.score < WEAKER:  # leaving out anything would cost more
@@ -67,17 +67,17 @@ def consistent(links: Links, survey: Survey, method: Method) -> tuple[list[int],
     return sorted(best.links), best.places[0][1][:2]
 
 
-def _grown(links: Links, survey: Survey, method: Method, triple: list[int]) -> Agreement | None:
+def _grown(links: Links, survey: Survey, settings: SolverSettings, triple: list[int]) -> Agreement | None:
     """A triple with every link that is consistent with it and with those taken before; None if it fits no place."""
     few = links.pick(triple)
-    fit = Strengths(few, survey, method)
+    fit = Strengths(few, survey, settings)
     found = distinct([fit.descend(np.array((*s, 0.0, survey.floor))) for s in starts(few)], DECIDED)[:RIVALS]
     if not found or found[0][0] > WEAKER:
         return None
     chosen, left_out = triple, 0.0
     for i in range(len(links.d)):
         if i not in triple:
-            fit = Strengths(links.pick([*chosen, i]), survey, method)
+            fit = Strengths(links.pick([*chosen, i]), survey, settings)
             more = distinct([fit.descend(theta) for _, theta in found], DECIDED)
             gate = WEAKER if _stronger(links, i, found[0][1]) < 0.0 else STRONGER
             if more and more[0][0] - found[0][0] < gate:

@@ -22,9 +22,9 @@ from estimator.paper.lateration_model import (
     LINK_N,
     Doubt,
     Links,
-    Method,
     Received,
     Solver,
+    SolverSettings,
     expected_error,
     shortest,
     spread,
@@ -91,23 +91,25 @@ class Located:
     used: tuple[int, ...] = ()
 
 
-def locate(received: Received, survey: Survey, method: Method | None = None, prior: Prior | None = None) -> Located:
+def locate(
+    received: Received, survey: Survey, settings: SolverSettings | None = None, prior: Prior | None = None
+) -> Located:
     """Where the receiver is according to these strengths; never raises for bad geometry, but says what is not known.
 
     With two links, or lamps in a line, two places fit that mirror each other: ``prior`` chooses, where it can.
     """
-    method = Method() if method is None else method
-    links = usable(received, survey, method)
-    if method.adaptive:
-        links = links.pick(adapted(links, survey, method))
-    elif method.link_n is not None and len(links.d) > method.link_n:
-        links = links.pick(range(method.link_n))
+    settings = SolverSettings() if settings is None else settings
+    links = usable(received, survey, settings)
+    if settings.adaptive:
+        links = links.pick(adapted(links, survey, settings))
+    elif settings.link_n is not None and len(links.d) > settings.link_n:
+        links = links.pick(range(settings.link_n))
     used = tuple(links.at.tolist())
     if not used:
         return Located(Why.NONE)
     if len(used) == 1 or spread(links.xy)[0] < SAME_M:
-        return Located(Why.CIRCLE, (), _circle(links, method.doubt), used)
-    places = [_place(links, survey, method, theta) for theta in solve(links, survey, method)]
+        return Located(Why.CIRCLE, (), _circle(links, settings.doubt), used)
+    places = [_place(links, survey, settings, theta) for theta in solve(links, survey, settings)]
     return _decide(places, used, prior)
 
 
@@ -135,14 +137,14 @@ def _circle(links: Links, doubt: Doubt) -> Circle:
     return Circle(float(links.xy[0, 0]), float(links.xy[0, 1]), radius, float(sigma))
 
 
-def _place(links: Links, survey: Survey, method: Method, theta: Array) -> Place:
+def _place(links: Links, survey: Survey, settings: SolverSettings, theta: Array) -> Place:
     """Uncertainty and fit at a solution."""
-    chi2 = Strengths(links, survey, method).chi2(theta)
-    covariance = expected_error(links, survey, method, theta[:2])
+    chi2 = Strengths(links, survey, settings).chi2(theta)
+    covariance = expected_error(links, survey, settings, theta[:2])
     return Place(theta[:2].copy(), covariance, chi2, max(len(links.d) - 2, 0), float(theta[2]), float(theta[3]))
 
 
 __all__ = [
-    "LINK_N", "Circle", "Doubt", "Located", "Method", "Place", "Prior", "Received", "Solver", "Why", "locate",
+    "LINK_N", "Circle", "Doubt", "Located", "Place", "Prior", "Received", "Solver", "SolverSettings", "Why", "locate",
     "shortest", "without_floor",
 ]  # fmt: skip

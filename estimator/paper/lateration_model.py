@@ -52,7 +52,7 @@ class Doubt:
 
 
 @dataclass(frozen=True, slots=True)
-class Method:
+class SolverSettings:
     """How to solve.
 
     Attributes:
@@ -148,8 +148,8 @@ class Links:
         return total
 
 
-def usable(received: Received, survey: Survey, method: Method) -> Links:
-    """Links that can be light of their lamps and came straight (see `Method.rim`), the shortest first."""
+def usable(received: Received, survey: Survey, settings: SolverSettings) -> Links:
+    """Links that can be light of their lamps and came straight (see `SolverSettings.rim`), the shortest first."""
     table, rx = pack_lamps(received.lamps, survey.depth), pack_receiver(survey.receiver)
     below = _below(table, rx)
     with np.errstate(invalid="ignore"):  # a strength that is not a number is not within bounds, and says no more
@@ -163,17 +163,17 @@ def usable(received: Received, survey: Survey, method: Method) -> Links:
     range2 = d**2 - h**2
     diffuse = below / amplitude
     own = np.array([received.lamps[i].sigma_ln for i in at])
-    lean = (method.doubt.tilt / h) ** 2 * np.maximum(range2, 0.0)
-    variance = received.variance[at] / amplitude**2 + own**2 + lean + (method.doubt.floor_own * diffuse) ** 2 + 1e-12
+    lean = (settings.doubt.tilt / h) ** 2 * np.maximum(range2, 0.0)
+    variance = received.variance[at] / amplitude**2 + own**2 + lean + (settings.doubt.floor_own * diffuse) ** 2 + 1e-12
     rim = below * max(rx[6], 0.0) ** exponent
     links = Links(table, rx, at, table[:, :2], h, amplitude, exponent, d, range2, rim, diffuse, variance)
     order = np.argsort(d, kind="stable")
-    return links.pick([int(i) for i in order if amplitude[i] >= method.rim * rim[i]])
+    return links.pick([int(i) for i in order if amplitude[i] >= settings.rim * rim[i]])
 
 
 def shortest(received: Received, survey: Survey, rim: float = 0.0) -> tuple[int, ...]:
     """Usable links (positive, finite, not below ``rim``), the shortest first; equal lamps: the strongest first."""
-    return tuple(usable(received, survey, Method(rim=rim)).at.tolist())
+    return tuple(usable(received, survey, SolverSettings(rim=rim)).at.tolist())
 
 
 def without_floor(received: Received, survey: Survey) -> Received:
@@ -200,7 +200,7 @@ def in_line(xy: Array) -> bool:
     return across < IN_LINE * along
 
 
-def expected_error(links: Links, survey: Survey, method: Method, xy: Array) -> Array:
+def expected_error(links: Links, survey: Survey, settings: SolverSettings, xy: Array) -> Array:
     """(2, 2) expected squared error of a solver at ``xy``, m^2: its sensitivity to errors times their covariance.
 
     `ls` and `lin` do not know of the floor: what it does to them is a bias, and counted in. No direction is more
@@ -208,8 +208,8 @@ def expected_error(links: Links, survey: Survey, method: Method, xy: Array) -> A
     """
     off = xy - links.xy
     d2 = np.sum(off**2, axis=1) + links.h**2
-    errors = links.covariance(method.doubt)
-    if method.solver is Solver.ML:
+    errors = links.covariance(settings.doubt)
+    if settings.solver is Solver.ML:
         J = -(links.exponent / d2)[:, None] * off
         covariance = _capped_inverse(J.T @ np.linalg.solve(errors, J))
     else:
@@ -217,11 +217,11 @@ def expected_error(links: Links, survey: Survey, method: Method, xy: Array) -> A
         bias = np.log1p(survey.floor / direct)
         swing = 2.0 * d2 / links.exponent
         moment = np.outer(swing, swing) * (errors + np.outer(bias, bias))
-        differences = method.solver is Solver.LIN and not in_line(links.xy)
+        differences = settings.solver is Solver.LIN and not in_line(links.xy)
         covariance = _sandwich(2.0 * (off - off.mean(axis=0) if differences else off), moment)
     size, axes = np.linalg.eigh(covariance)
     own = 2.0 * d2 / links.exponent * np.sqrt(np.diag(errors))  # of each squared range
-    combined = np.sum(own**-2.0) ** -0.5 if method.solver is Solver.ML else np.sqrt(np.sum(own**2)) / len(own)
+    combined = np.sum(own**-2.0) ** -0.5 if settings.solver is Solver.ML else np.sqrt(np.sum(own**2)) / len(own)
     capped: Array = (axes * np.clip(size, 1e-12, combined)) @ axes.T
     return capped
 

@@ -10,7 +10,7 @@ import numpy as np
 from estimator.light_filter.survey import Survey
 from estimator.numerics.arrays import Array
 from estimator.paper.lateration_kernels import by_range, by_strength, strength_step
-from estimator.paper.lateration_model import Links, Method, Solver, in_line, spread
+from estimator.paper.lateration_model import Links, Solver, SolverSettings, in_line, spread
 
 DECIDED: Final = 6.0
 """Difference of chi2 from which the worse of two places is given up: likelihoods 20 to 1."""
@@ -21,9 +21,9 @@ Solution = tuple[float, Array]
 """Cost, and x, y of the receiver (m), common ln gain, floor."""
 
 
-def solve(links: Links, survey: Survey, method: Method) -> list[Array]:
+def solve(links: Links, survey: Survey, settings: SolverSettings) -> list[Array]:
     """Places that fit at least two links whose lamps are apart, as (x, y, common ln gain, floor), best first."""
-    return SOLVERS[method.solver](links, survey, method)
+    return SOLVERS[settings.solver](links, survey, settings)
 
 
 def mirrored(xy: Array, place: Array) -> Array:
@@ -71,13 +71,13 @@ def distinct(found: Sequence[Solution], margin: float) -> list[Solution]:
 class Strengths:
     """Weighted fit of ln strength with the common gain and the floor as unknowns that have priors."""
 
-    def __init__(self, links: Links, survey: Survey, method: Method) -> None:
-        doubt = method.doubt
+    def __init__(self, links: Links, survey: Survey, settings: SolverSettings) -> None:
+        doubt = settings.doubt
         gain, floor = (1.0 / max(sigma, 1e-6) ** 2 for sigma in (doubt.common_ln, doubt.floor))
         self._table, self._rx = links.table, links.rx.copy()
         self._rx[6] = -1.0  # what is received has been seen: descents need no cliff at the edge of the field of view
         self._data = np.vstack((np.log(links.amplitude), 1.0 / links.variance))
-        self._prior = np.array((method.yaw, 0.0, gain, survey.floor, floor))
+        self._prior = np.array((settings.yaw, 0.0, gain, survey.floor, floor))
         self._system = np.empty((4, 5))
 
     def chi2(self, theta: Array) -> float:
@@ -90,11 +90,11 @@ class Strengths:
         return by_strength(self._table, self._rx, self._data, self._prior, end, self._system), end
 
 
-def _by_lines(links: Links, survey: Survey, method: Method) -> list[Array]:
+def _by_lines(links: Links, survey: Survey, settings: SolverSettings) -> list[Array]:
     return [np.array((*p, 0.0, survey.floor)) for p in linear(links)]
 
 
-def _by_range(links: Links, survey: Survey, method: Method) -> list[Array]:
+def _by_range(links: Links, survey: Survey, settings: SolverSettings) -> list[Array]:
     """Eq. 4: the least of its minima, or both of a mirror pair."""
     data, system = np.vstack((links.range2, np.ones(len(links.d)))), np.empty((2, 3))
     found = []
@@ -105,14 +105,14 @@ def _by_range(links: Links, survey: Survey, method: Method) -> list[Array]:
     return ends[: 2 if in_line(links.xy) else 1]
 
 
-def _by_strength(links: Links, survey: Survey, method: Method) -> list[Array]:
+def _by_strength(links: Links, survey: Survey, settings: SolverSettings) -> list[Array]:
     """Every minimum that is not clearly worse than the best."""
-    fit = Strengths(links, survey, method)
+    fit = Strengths(links, survey, settings)
     found = [fit.descend(np.array((*start, 0.0, survey.floor))) for start in starts(links)]
     return [theta for _, theta in distinct(found, DECIDED)]
 
 
-SOLVERS: Final[dict[Solver, Callable[[Links, Survey, Method], list[Array]]]] = {
+SOLVERS: Final[dict[Solver, Callable[[Links, Survey, SolverSettings], list[Array]]]] = {
     Solver.LS: _by_range,
     Solver.LIN: _by_lines,
     Solver.ML: _by_strength,

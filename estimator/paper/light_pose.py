@@ -26,7 +26,7 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import symmetric
 from estimator.paper.lateration import Place, Prior
-from estimator.paper.lateration_model import LINK_N, Method, Solver
+from estimator.paper.lateration_model import LINK_N, Solver, SolverSettings
 from estimator.paper.point_to_point_sums import align
 from estimator.paper.shortest_link import PAUSED, links_of, misfit, select
 from estimator.result import Fix, LightsResult, Virtual
@@ -48,7 +48,7 @@ class LightPose:
     """The light solution by the paper's means.
 
     Attributes:
-        method: solver and Link_n. T, P: pose (x, y, yaw) and covariance (3, 3) at ``t_mono``; in the survey's frame
+        settings: solver and Link_n. T, P: pose (x, y, yaw) and covariance (3, 3) at ``t_mono``; in the survey's frame
             once ``placed``, before that in the frame of the wheels' start. velocity: (v_x, v_y, yaw rate), base frame.
         selection: links and place of the latest epoch. result: after the latest epoch.
     """
@@ -56,7 +56,7 @@ class LightPose:
     def __init__(self, setup: LightsSetup, noise: MotionNoise, link_n: int = LINK_N) -> None:
         """Nothing received yet; raises ValueError for an impossible survey or stored sample clock."""
         self.setup, self.noise = setup, noise
-        self.method = Method(Solver.LS, link_n)
+        self.settings = SolverSettings(Solver.LS, link_n)
         self.decoder = decoder.new_decoder(setup.profile, setup.clock_ppm, {lamp.code for lamp in setup.survey.lamps})
         self.catalogue = catalogue_of(setup.survey)
         self.lever = np.array((setup.survey.receiver.x, setup.survey.receiver.y))
@@ -103,7 +103,7 @@ class LightPose:
         T = self.at(0.5 * (epoch.t_begin + epoch.t_end))
         receiver, J = self._receiver(T)
         prior = Prior(receiver, J @ self.P @ J.T + 1e-6 * np.eye(2)) if self.placed else None
-        self.selection = select(epoch, self.catalogue, self.setup.survey, self.method, prior)
+        self.selection = select(epoch, self.catalogue, self.setup.survey, self.settings, prior)
         self.t_epoch = epoch.t_end
         place = self.selection.place
         if place is not None and self.placed:
@@ -122,7 +122,7 @@ class LightPose:
     def misfit(self) -> float:
         """Mean squared normalised residual of the links in use at the pose; 0 without any."""
         used = self.selection.used
-        return 0.0 if used is None else misfit(used, self.method, self._receiver(self.at(self.t_epoch))[0])
+        return 0.0 if used is None else misfit(used, self.settings, self._receiver(self.at(self.t_epoch))[0])
 
     def _receiver(self, T: Array) -> tuple[Array, Array]:
         """Place (2,) of the receiver with the base at ``T``, and its Jacobian (2, 3) by that pose (Eq. 7)."""
@@ -168,7 +168,7 @@ class LightPose:
             fix=found if accepted else paused,
             T_map_base=self.T,
             covariance=self.P,
-            links=links_of(self.selection, self.method, xy),
+            links=links_of(self.selection, self.settings, xy),
             accepted=accepted,
             gained=nothing,
             gained_by=np.zeros(3),

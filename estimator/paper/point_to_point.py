@@ -33,8 +33,8 @@ class Reference:
     """The reference frame S_ref: a scan's points on the single distance axis, and what they say of surfaces.
 
     Attributes:
-        axis: around the lidar. surfaces: (n, 4) per row, see `point_sums.surfaces`. segments: between neighbours, for
-            the beam model.
+        axis: around the lidar. surfaces: (n, 4) per row, see `point_to_point_sums.surfaces`. segments: between
+            neighbours, for the beam model.
     """
 
     axis: Axis
@@ -188,7 +188,7 @@ def advance(course: Course, after: Array, limits: Limits) -> None:
 def along(sums: Array, step: Array) -> float:
     """Root mean square way by which a step (x, y, yaw) moves the pairs along their normals, m; the step's own without.
 
-    ``sums``: of `point_sums.sum_up`.
+    ``sums``: of `point_to_point_sums.sum_up`.
     """
     x, y, yaw = step[0], step[1], se2.wrap(float(step[2]))
     square = sums[0] * x * x + sums[3] * y * y + sums[5] * yaw * yaw
@@ -207,7 +207,7 @@ def note(course: Course, gate: float, sought: int) -> None:
 
 
 def information(new: New, reference: Reference, course: Course) -> Array:
-    """The laser's information at the solution, see `point_sums`; pose-centred in the reference's axes."""
+    """The laser's information at the solution, see `point_to_point_sums`; pose-centred in the reference's axes."""
     A, B, g, d, H = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.zeros((3, 3))
     T, fused, gate = course.T.copy(), None, max(6.0 * course.scale, 0.1)
     for _ in range(PROBES):

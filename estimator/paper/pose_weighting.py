@@ -1,16 +1,12 @@
-"""Two witnesses of one motion, weighed (Eq. 14-15) on the group of rigid motions.
+"""Two estimates of one motion, weighted (Eq. 14-15) on the group of rigid motions.
 
-Eq. 14 reads ``T_k = w T1 + (1 - w) T2``. A sum of two homogeneous matrices is no rigid motion, so the same is said
-along the shortest way between the two: ``T_k = T2 Exp(W Log(T2^-1 T1))``; ``W = 0`` is T2, ``W = 1`` is T1. What the
-weight is, Eq. 15 tells in two ways (:class:`Weight`).
+Eq. 14 reads ``T_k = w T1 + (1 - w) T2``. A sum of two homogeneous matrices is no rigid motion. The same combination
+along the shortest way between the two is: ``T_k = T2 Exp(W Log(T2^-1 T1))``; ``W = 0`` is T2, ``W = 1`` is T1.
+:class:`Weight` has two forms of W, after Eq. 15.
 
-No information is counted twice. T1 comes from the `lights` filter (odometry and lamps, never laser), T2 from the laser
-alone, and a `MatchResult` reports the laser's information only. the pose predicts with the same odometry as `lights`
-does; therefore it never takes the lights' pose with its covariance, but through ``T_map_odom`` and only what links have
-*added* (``LightsResult.gained``, see `absolute.gain`), each epoch once and for one stretch of way no more than one
-filter's worth. The default matcher takes T1 from the pose itself: its prediction is the prior inside the normal
-equations, whose solution is this combination to first order, and `fusion.fuse` adds the laser's information to the
-prediction's once.
+T1 comes from wheels and lamps (`light_pose`), T2 from the lidar alone, and a `MatchResult` has the information of the
+lidar only. The daemon's matcher has the prediction as a prior inside its normal equations. Their solution is this
+combination, with the matrix weight, to first order.
 """
 
 from __future__ import annotations
@@ -27,7 +23,7 @@ from estimator.numerics.symmetric3 import invert3
 class Weight(Enum):
     """How Eq. 15 weighs T1 against T2 in the paper's matcher."""
 
-    INFORMATION = "matrix (L1 + L2)^-1 L1: each direction from the witness that knows it"
+    INFORMATION = "matrix (L1 + L2)^-1 L1: each direction from the estimate that knows it"
     PAPER = "scalar ratio of the probabilities of both measurements at the present pose, in each iteration"
 
 

@@ -19,7 +19,7 @@ from estimator.light_filter.lamp_catalogue import Catalogue
 from estimator.light_filter.survey import Lamp, Survey
 from estimator.numerics.arrays import Array
 from estimator.paper.lateration import Place, Prior, Why, locate
-from estimator.paper.lateration_model import Links, Method, Received, usable
+from estimator.paper.lateration_model import Links, Received, SolverSettings, usable
 from estimator.result import Link, LinkState
 
 FAINT: Final = 5.0
@@ -64,14 +64,16 @@ class Selection:
 PAUSED: Final = Selection((), ())
 
 
-def select(epoch: LightEpoch, catalogue: Catalogue, survey: Survey, method: Method, prior: Prior | None) -> Selection:
+def select(
+    epoch: LightEpoch, catalogue: Catalogue, survey: Survey, settings: SolverSettings, prior: Prior | None
+) -> Selection:
     """The place that the Link_n shortest links of an epoch give.
 
     Args:
         epoch: from the decoder.
         catalogue: the lamps; those that describe themselves in this epoch are added.
         survey: receiver and depth.
-        method: solver and Link_n.
+        settings: solver and Link_n.
         prior: the receiver's place beforehand, to tell lamps of one code and mirror images apart; None: not known.
     """
     if epoch.block & UNUSABLE:
@@ -84,12 +86,12 @@ def select(epoch: LightEpoch, catalogue: Catalogue, survey: Survey, method: Meth
         np.array([rows[k].rss for k in fit]),
         np.array([rows[k].variance for k in fit]),
     )
-    links = usable(received, survey, method)
+    links = usable(received, survey, settings)
     clear = tuple(fit[i] for i in links.at.tolist())
-    n = len(clear) if method.link_n is None else method.link_n
+    n = len(clear) if settings.link_n is None else settings.link_n
     if len(clear) < max(n, 1):
         return Selection(tuple(rows), clear)
-    located = locate(received, survey, method, prior)
+    located = locate(received, survey, settings, prior)
     place = located.places[0] if located.why in (Why.PLACE, Why.PRIOR) else None
     return Selection(tuple(rows), clear, links.pick(range(n)), place)
 
@@ -116,12 +118,12 @@ def nearest(lamps: list[Lamp], xy: Array) -> Lamp:
     return min(lamps, key=lambda lamp: math.hypot(lamp.x - float(xy[0]), lamp.y - float(xy[1])))
 
 
-def links_of(selection: Selection, method: Method, xy: Array | None) -> tuple[Link, ...]:
+def links_of(selection: Selection, settings: SolverSettings, xy: Array | None) -> tuple[Link, ...]:
     """The links as results, the strongest first; residuals against the receiver's place ``xy`` (None: not known)."""
     used = set() if selection.place is None or selection.used is None else set(selection.clear[: len(selection.used.d)])
     residuals = dict[int, tuple[float, float]]()
     if xy is not None and selection.used is not None:
-        both = zip(*deviations(selection.used, method, xy), strict=True)
+        both = zip(*deviations(selection.used, settings, xy), strict=True)
         residuals = dict(zip(selection.clear, ((float(r), float(s)) for r, s in both), strict=False))
     found = []
     for k, one in enumerate(selection.heard):
@@ -133,12 +135,12 @@ def links_of(selection: Selection, method: Method, xy: Array | None) -> tuple[Li
     return tuple(found)
 
 
-def deviations(links: Links, method: Method, xy: Array) -> tuple[Array, Array]:
+def deviations(links: Links, settings: SolverSettings, xy: Array) -> tuple[Array, Array]:
     """Residuals (n,) of ln RSS with the receiver at ``xy``, and one sigma (n,) of each."""
-    return links.residuals(xy), np.sqrt(np.diag(links.covariance(method.doubt)))
+    return links.residuals(xy), np.sqrt(np.diag(links.covariance(settings.doubt)))
 
 
-def misfit(links: Links, method: Method, xy: Array) -> float:
+def misfit(links: Links, settings: SolverSettings, xy: Array) -> float:
     """Mean squared normalised residual of the links with the receiver at ``xy`` (Eq. 6); 1 is expected."""
-    residual, sigma = deviations(links, method, xy)
+    residual, sigma = deviations(links, settings, xy)
     return float(np.mean(np.square(residual / sigma)))

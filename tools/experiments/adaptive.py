@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator.paper.lateration import Doubt, Method, Prior, Solver
+from estimator.paper.lateration import Doubt, Prior, Solver, SolverSettings
 from tools.ci.figures import Figure
 from tools.experiments.places import CENTRED, Array, error, sheet_of, spots
 from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
@@ -75,7 +75,7 @@ def trial(job: tuple[int, int, bool]) -> Array:
     priors = [Prior(spot.xy + PRIOR_M * rng.standard_normal(2), PRIOR_M**2 * np.eye(2)) for spot in met]
     rows = []
     for solver in SOLVERS:
-        base = Method(solver, None, doubt=DOUBT)
+        base = SolverSettings(solver, None, doubt=DOUBT)
         methods = [*(replace(base, link_n=n) for n in FIXED), replace(base, adaptive=True)]
         rows.append([
             [error(spot, sheet, method, prior) for spot, prior in zip(met, priors, strict=True)] for method in methods

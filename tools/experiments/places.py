@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.light_filter.survey import Survey
-from estimator.paper.lateration import Method, Prior, Received, locate
+from estimator.paper.lateration import Prior, Received, SolverSettings, locate
 from tools.sim.ceiling.ceiling import Ceiling, Photodiode
 from tools.sim.ceiling.links import EPOCH_S, Reception
 from tools.sim.ceiling.records import survey
@@ -54,7 +54,7 @@ def sheet_of(ceiling: Ceiling, sigma_ln: float) -> Survey:
     return replace(plain, lamps=tuple(replace(lamp, sigma_ln=sigma_ln) for lamp in plain.lamps))
 
 
-def error(spot: Spot, sheet: Survey, method: Method, prior: Prior | None = None) -> float:
+def error(spot: Spot, sheet: Survey, method: SolverSettings, prior: Prior | None = None) -> float:
     """Distance from the truth, m; NaN where there is no place at all (fewer than two links)."""
     found = locate(spot.received, sheet, method, prior)
     return float(np.hypot(*(found.places[0].xy - spot.xy))) if found.places else float("nan")

@@ -23,7 +23,7 @@ from daemon.system import console
 from estimator.light_filter.lambertian import Wrt, expected
 from estimator.light_filter.survey import Lamp, Receiver, Survey
 from estimator.paper.lateration import locate
-from estimator.paper.lateration_model import Doubt, Method, Received
+from estimator.paper.lateration_model import Doubt, Received, SolverSettings
 
 Cells = npt.NDArray[np.int8]
 FITTING = Fitting(2.2)
@@ -83,7 +83,7 @@ def test_predicted_deviations_are_those_of_the_estimators_solver() -> None:
             ln = 0.05 * RNG.normal() + RNG.normal(size=len(near)) / np.sqrt(rows[:, 5])
             amplitude = model.amplitude[near] * np.exp(ln)
             received = Received(tuple(lamps[i] for i in near), amplitude, np.full(len(near), 1e-24))
-            found = locate(received, survey, Method(link_n=None, rim=0.0, doubt=Doubt(floor=0.0)))
+            found = locate(received, survey, SolverSettings(link_n=None, rim=0.0, doubt=Doubt(floor=0.0)))
             place = min(found.places, key=lambda p: math.hypot(*(p.xy - (x, y))))
             error.append(place.xy - (x, y))
         axis = math.sqrt(max(np.linalg.eigvalsh(np.cov(np.array(error).T))))

@@ -15,10 +15,10 @@ from estimator.paper.lateration import (
     Circle,
     Doubt,
     Located,
-    Method,
     Prior,
     Received,
     Solver,
+    SolverSettings,
     Why,
     locate,
     shortest,
@@ -64,7 +64,7 @@ def test_exact_without_noise(rows: list[tuple[float, ...]], x: float, y: float, 
     lamps = tuple(Lamp(i, i, r[0], r[1], r[2], power_w=r[3], order=r[4], sigma_ln=0.01) for i, r in enumerate(rows))
     receiver = Receiver(z=0.3, half_fov_rad=1.55)
     received = receive(survey_of(lamps, receiver=receiver), (x, y))
-    found = locate(received, survey_of(lamps, receiver=receiver), Method(solver, None, rim=0.0, doubt=EXACT))
+    found = locate(received, survey_of(lamps, receiver=receiver), SolverSettings(solver, None, rim=0.0, doubt=EXACT))
     xy = np.array([(p.x, p.y) for p in lamps])
     across = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
     if across[1] > 0.5:
@@ -76,7 +76,7 @@ def test_exact_without_noise(rows: list[tuple[float, ...]], x: float, y: float, 
 def test_paper_room(solver: Solver) -> None:
     survey = survey_of(PAPER)
     for xy in ((5.1, 4.7), (1.0, 1.3), (8.4, 3.3), (0.4, 9.5)):
-        found = locate(receive(survey, xy), survey, Method(solver))
+        found = locate(receive(survey, xy), survey, SolverSettings(solver))
         assert len(found.used) <= 4
         assert nearest(found, xy) < 1e-6
 
@@ -88,9 +88,9 @@ def test_floor_and_leaning_receiver_are_part_of_ml() -> None:
     received = receive(survey, (4.0, 6.0), yaw)
     c, s = np.cos(yaw), np.sin(yaw)
     truth = (4.0 + c * 0.1 + s * 0.05, 6.0 + s * 0.1 - c * 0.05)
-    found = locate(received, survey, Method(link_n=None, yaw=yaw))
+    found = locate(received, survey, SolverSettings(link_n=None, yaw=yaw))
     assert nearest(found, truth) < 1e-5
-    wrong = locate(received, survey, Method(Solver.LS, yaw=yaw))
+    wrong = locate(received, survey, SolverSettings(Solver.LS, yaw=yaw))
     assert nearest(wrong, truth) > 0.02
 
 
@@ -99,15 +99,15 @@ def test_two_links_are_a_mirror_pair_that_a_prior_decides(solver: Solver) -> Non
     lamps = (Lamp(1, 1, 0.0, 0.0, 2.9), Lamp(2, 2, 2.0, 0.0, 2.9))
     survey = survey_of(lamps)
     received = receive(survey, (0.7, 1.2))
-    found = locate(received, survey, Method(solver))
+    found = locate(received, survey, SolverSettings(solver))
     assert found.why is Why.MIRROR
     assert sorted(round(float(p.xy[1]), 4) for p in found.places) == [-1.2, 1.2]
     near = Prior(np.array((0.5, 1.0)), 0.01 * np.eye(2))
-    decided = locate(received, survey, Method(solver), near)
+    decided = locate(received, survey, SolverSettings(solver), near)
     assert decided.why is Why.PRIOR
     assert nearest(decided, (0.7, 1.2)) < 1e-6
     vague = Prior(np.array((0.5, 0.1)), 100.0 * np.eye(2))
-    undecided = locate(received, survey, Method(solver), vague)
+    undecided = locate(received, survey, SolverSettings(solver), vague)
     assert undecided.why is Why.MIRROR
     assert undecided.places[0].xy[1] > 0.0
 
@@ -116,7 +116,7 @@ def test_two_links_are_a_mirror_pair_that_a_prior_decides(solver: Solver) -> Non
 def test_lamps_in_a_line_mirror_too(solver: Solver) -> None:
     lamps = tuple(Lamp(i, i, 1.5 * i, 0.75 * i, 2.9) for i in range(4))
     survey = survey_of(lamps)
-    found = locate(receive(survey, (2.0, 2.0)), survey, Method(solver))
+    found = locate(receive(survey, (2.0, 2.0)), survey, SolverSettings(solver))
     assert found.why is Why.MIRROR
     assert len(found.places) == 2
     assert nearest(found, (2.0, 2.0)) < 1e-5
@@ -126,7 +126,7 @@ def test_lamps_in_a_line_mirror_too(solver: Solver) -> None:
 def test_under_the_line_there_is_one_place_with_an_honest_covariance(solver: Solver) -> None:
     lamps = tuple(Lamp(i, i, 2.0 * i, 0.0, 2.9) for i in range(3))
     survey = survey_of(lamps)
-    found = locate(receive(survey, (1.3, 0.0)), survey, Method(solver))
+    found = locate(receive(survey, (1.3, 0.0)), survey, SolverSettings(solver))
     assert nearest(found, (1.3, 0.0)) < 0.2
     along, across = np.sqrt(np.diag(found.places[0].covariance))
     assert 0.3 < across < 2.0
@@ -150,7 +150,7 @@ def test_unusable_strengths_are_left_out() -> None:
     for bad in (0.0, -1e-6, float("nan"), float("inf")):
         damaged = Received(received.lamps, received.amplitude.copy(), received.variance)
         damaged.amplitude[0] = bad
-        found = locate(damaged, survey, Method(link_n=None))
+        found = locate(damaged, survey, SolverSettings(link_n=None))
         assert 0 not in found.used
         assert nearest(found, (2.5, 3.0)) < 0.01
     with pytest.raises(ValueError, match="6 lamps"):
@@ -179,7 +179,7 @@ def test_nothing_raises_and_what_is_returned_is_finite(
 ) -> None:
     lamps = tuple(Lamp(i, i, x, y, 2.9) for i, (x, y) in enumerate(places))
     received = Received(lamps, np.array(strengths[: len(lamps)]), np.full(len(lamps), variance))
-    found = locate(received, survey_of(lamps, floor), Method(solver, None, adaptive, rim=0.0))
+    found = locate(received, survey_of(lamps, floor), SolverSettings(solver, None, adaptive, rim=0.0))
     for place in found.places:
         assert np.isfinite(place.xy).all()
         assert np.isfinite(place.covariance).all()
@@ -190,7 +190,7 @@ def test_nothing_raises_and_what_is_returned_is_finite(
 
 def perturbed(received: Received, survey: Survey, doubt: Doubt, rng: np.random.Generator) -> Received:
     """Errors of exactly the kind that the model of errors describes (but for tilt)."""
-    links = usable(received, survey, Method(doubt=doubt, rim=0.0))
+    links = usable(received, survey, SolverSettings(doubt=doubt, rim=0.0))
     error = rng.multivariate_normal(np.zeros(len(links.at)), links.covariance(doubt))
     amplitude = received.amplitude.copy()
     amplitude[links.at] *= np.exp(error)
@@ -209,7 +209,7 @@ def test_covariance_is_consistent(solver: Solver, link_n: int | None) -> None:
     for _ in range(250):
         xy = rng.uniform(2.5, 7.5, 2)
         received = perturbed(receive(survey, xy), survey, doubt, rng)
-        place = locate(received, survey, Method(solver, link_n, doubt=doubt)).places[0]
+        place = locate(received, survey, SolverSettings(solver, link_n, doubt=doubt)).places[0]
         off = place.xy - xy
         ratios.append(off @ np.linalg.solve(place.covariance, off))
     assert 1.5 < np.mean(ratios) < 2.6
@@ -218,11 +218,11 @@ def test_covariance_is_consistent(solver: Solver, link_n: int | None) -> None:
 def test_chi2_tells_a_bad_link() -> None:
     survey = survey_of(PAPER, 0.016)
     received = receive(survey, (5.0, 4.0))
-    good = locate(received, survey, Method(link_n=None)).places[0]
+    good = locate(received, survey, SolverSettings(link_n=None)).places[0]
     assert good.chi2 < 0.01
     assert good.freedom == len(received.lamps) - 2
     received.amplitude[int(np.argmax(received.amplitude))] *= 0.6
-    assert locate(received, survey, Method(link_n=None)).places[0].chi2 > 20.0
+    assert locate(received, survey, SolverSettings(link_n=None)).places[0].chi2 > 20.0
 
 
 def test_shortest_links_first_and_none_from_beyond_the_rim() -> None:
@@ -243,11 +243,11 @@ def test_without_floor_undoes_a_known_floor() -> None:
     survey, bare = survey_of(PAPER, 0.016), survey_of(PAPER)
     received, clean = receive(survey, (4.0, 4.5)), receive(bare, (4.0, 4.5))
     np.testing.assert_allclose(without_floor(received, survey).amplitude, clean.amplitude, rtol=1e-12)
-    assert nearest(locate(received, survey, Method(Solver.LS)), (4.0, 4.5)) > 0.02
-    assert nearest(locate(without_floor(received, survey), survey, Method(Solver.LS)), (4.0, 4.5)) < 1e-6
+    assert nearest(locate(received, survey, SolverSettings(Solver.LS)), (4.0, 4.5)) > 0.02
+    assert nearest(locate(without_floor(received, survey), survey, SolverSettings(Solver.LS)), (4.0, 4.5)) < 1e-6
 
 
-def count(received: Received, survey: Survey, method: Method) -> int:
+def count(received: Received, survey: Survey, method: SolverSettings) -> int:
     return len(adapted(usable(received, survey, method), survey, method))
 
 
@@ -255,12 +255,12 @@ def test_adaptive_number_fits_the_solver() -> None:
     """Far links spoil the plain solver (floor, error of d^2) and help the weighted one."""
     survey = survey_of(PAPER, 0.016)
     received = receive(survey, (5.0, 5.0))
-    plain = count(received, survey, Method(Solver.LS, None))
-    weighted = count(received, survey, Method(Solver.ML, None))
+    plain = count(received, survey, SolverSettings(Solver.LS, None))
+    weighted = count(received, survey, SolverSettings(Solver.ML, None))
     assert 3 <= plain < weighted == len(shortest(received, survey, 0.6))
-    assert count(received, survey, Method(Solver.ML, 5)) == 5
-    assert len(locate(received, survey, Method(Solver.LS, None, adaptive=True)).used) == plain
-    assert count(received.pick((0, 1)), survey, Method()) == 2
+    assert count(received, survey, SolverSettings(Solver.ML, 5)) == 5
+    assert len(locate(received, survey, SolverSettings(Solver.LS, None, adaptive=True)).used) == plain
+    assert count(received.pick((0, 1)), survey, SolverSettings()) == 2
 
 
 @pytest.mark.parametrize("blocked", range(4))
@@ -270,7 +270,7 @@ def test_adaptive_leaves_out_what_contradicts(blocked: int) -> None:
     received = receive(survey, (4.6, 5.3))
     hidden = shortest(received, survey)[blocked]
     received.amplitude[hidden] *= 0.4
-    spoilt = locate(received, survey, Method(link_n=None))
-    found = locate(received, survey, Method(link_n=None, adaptive=True))
+    spoilt = locate(received, survey, SolverSettings(link_n=None))
+    found = locate(received, survey, SolverSettings(link_n=None, adaptive=True))
     assert hidden not in found.used
     assert nearest(found, (4.6, 5.3)) < 0.02 < nearest(spoilt, (4.6, 5.3))

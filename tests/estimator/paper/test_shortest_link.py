@@ -14,24 +14,24 @@ from estimator.light_filter.lamp_catalogue import catalogue_of
 from estimator.light_filter.survey import Survey
 from estimator.measurements import Array
 from estimator.paper.lateration import Prior
-from estimator.paper.lateration_model import Method, Solver
+from estimator.paper.lateration_model import Solver, SolverSettings
 from estimator.paper.shortest_link import PAUSED, Selection, links_of, misfit, select
 from estimator.result import LinkState
 from tests.estimator.paper.lamps import GRID, SURVEY, epoch_at, epoch_of, receiver_at, rss_of
 
-METHOD = Method(Solver.LS, 4)
+SETTINGS = SolverSettings(Solver.LS, 4)
 T = np.array((1.9, 2.1, 0.7))
 XY = receiver_at(T)
 
 
 def selected(
-    epoch: LightEpoch, prior: Prior | None = None, survey: Survey = SURVEY, method: Method = METHOD
+    epoch: LightEpoch, prior: Prior | None = None, survey: Survey = SURVEY, settings: SolverSettings = SETTINGS
 ) -> Selection:
-    return select(epoch, catalogue_of(survey), survey, method, prior)
+    return select(epoch, catalogue_of(survey), survey, settings, prior)
 
 
 def states(found: Selection, xy: Array | None = None) -> dict[int, LinkState]:
-    return {link.code: link.state for link in links_of(found, METHOD, xy)}
+    return {link.code: link.state for link in links_of(found, SETTINGS, xy)}
 
 
 def test_the_four_shortest_links_give_the_place() -> None:
@@ -43,7 +43,7 @@ def test_the_four_shortest_links_give_the_place() -> None:
     used = {lamp.code for lamp in nearest[:4]}
     assert found.accepted == {GRID[code].lamp_id for code in used}
     assert states(found) == {code: LinkState.ACCEPTED if code in used else LinkState.PAUSED for code in range(9)}
-    links = links_of(found, METHOD, None)
+    links = links_of(found, SETTINGS, None)
     assert [link.amplitude for link in links] == sorted((link.amplitude for link in links), reverse=True)
 
 
@@ -68,9 +68,9 @@ def test_fewer_than_link_n_clear_links_pause_light_as_a_whole() -> None:
 
 def test_link_n_is_a_setting() -> None:
     epoch = epoch_at(T, codes=range(6))
-    assert len(selected(epoch, method=Method(Solver.LS, 3)).accepted) == 3
-    assert len(selected(epoch, method=Method(Solver.LS, 6)).accepted) == 6
-    assert selected(epoch, method=Method(Solver.LS, 7)).place is None
+    assert len(selected(epoch, settings=SolverSettings(Solver.LS, 3)).accepted) == 3
+    assert len(selected(epoch, settings=SolverSettings(Solver.LS, 6)).accepted) == 6
+    assert selected(epoch, settings=SolverSettings(Solver.LS, 7)).place is None
 
 
 def test_a_link_is_paused_by_itself() -> None:
@@ -104,7 +104,7 @@ def test_a_code_in_use_twice_needs_the_place() -> None:
     assert 104 in known.accepted
     both = selected(epoch_of([(k, rss_of(GRID[k], XY)) for k in range(9)], flags={4: LinkFlag.TWIN}), prior, survey)
     assert states(both)[4] is LinkState.TWIN
-    assert next(link for link in links_of(both, METHOD, None) if link.code == 4).lamp_id is None
+    assert next(link for link in links_of(both, SETTINGS, None) if link.code == 4).lamp_id is None
 
 
 def test_a_lamp_may_describe_itself() -> None:
@@ -121,9 +121,9 @@ def test_a_lamp_may_describe_itself() -> None:
 
 def test_lamps_in_a_line_leave_two_places_until_one_is_known() -> None:
     epoch = epoch_of([(code, rss_of(GRID[code], XY)) for code in (0, 3, 6)])
-    method = Method(Solver.LS, 3)
-    assert selected(epoch, method=method).place is None
-    found = selected(epoch, Prior(XY + 0.2, 0.04 * np.eye(2)), method=method)
+    settings = SolverSettings(Solver.LS, 3)
+    assert selected(epoch, settings=settings).place is None
+    found = selected(epoch, Prior(XY + 0.2, 0.04 * np.eye(2)), settings=settings)
     assert found.place is not None
     np.testing.assert_allclose(found.place.xy, XY, atol=1e-5)
 
@@ -133,13 +133,13 @@ def test_residuals_are_of_received_against_expected_rss() -> None:
     links = [(code, rss_of(GRID[code], XY) * (1.1 if code == 4 else 1.0)) for code in (0, 1, 3, 4)]
     found = selected(epoch_of(links))
     assert found.used is not None
-    residuals = {link.code: link.residual for link in links_of(found, METHOD, XY)}
+    residuals = {link.code: link.residual for link in links_of(found, SETTINGS, XY)}
     assert residuals[4] == pytest.approx(math.log(1.1), abs=1e-9)
     assert residuals[0] == pytest.approx(0.0, abs=1e-9)
     elsewhere = XY + np.array((0.3, 0.1))
-    for link in links_of(found, METHOD, elsewhere):
+    for link in links_of(found, SETTINGS, elsewhere):
         expected = rss_of(GRID[link.code], elsewhere)
         assert link.residual == pytest.approx(math.log(link.amplitude / expected), abs=1e-9)
-    by_hand = [(link.residual or 0.0) / (link.sigma or 1.0) for link in links_of(found, METHOD, XY)]
-    assert misfit(found.used, METHOD, XY) == pytest.approx(np.mean(np.square(by_hand)))
-    assert misfit(found.used, METHOD, XY) < misfit(found.used, METHOD, elsewhere)
+    by_hand = [(link.residual or 0.0) / (link.sigma or 1.0) for link in links_of(found, SETTINGS, XY)]
+    assert misfit(found.used, SETTINGS, XY) == pytest.approx(np.mean(np.square(by_hand)))
+    assert misfit(found.used, SETTINGS, XY) < misfit(found.used, SETTINGS, elsewhere)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from estimator.light_filter.survey import Survey
-from estimator.paper.lateration import Method, Solver
+from estimator.paper.lateration import Solver, SolverSettings
 from tools.experiments import adaptive
 from tools.experiments.paper_figures import fig4, fig4_recorded
 from tools.experiments.places import CENTRED, error, grid, sheet_of, spots
@@ -31,7 +31,7 @@ def test_simulator_and_solver_agree_where_nothing_departs_from_the_book() -> Non
     at = grid((-4.5, 4.5), (-4.5, 4.5), 1.5)
     for spot in spots(ceiling, sheet, at, np.random.default_rng(1)):
         assert 3 <= len(spot.received.lamps) <= 12
-        assert error(spot, sheet, Method(Solver.ML, None)) < 0.02
+        assert error(spot, sheet, SolverSettings(Solver.ML, None)) < 0.02
 
 
 def test_lamps_out_of_view_are_told_apart() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.light_filter.survey import Survey
-from estimator.paper.lateration import Doubt, Method, Solver, without_floor
+from estimator.paper.lateration import Doubt, Solver, SolverSettings, without_floor
 from tools.ci.figures import Figure
 from tools.experiments.paper_figures.fig4_recorded import recorded
 from tools.experiments.places import CENTRED, Spot, error, grid, sheet_of, spots
@@ -45,7 +45,7 @@ class Contestant:
     """A way to solve. ``beyond``: it also gets links of lamps out of view, as a decoder reports them."""
 
     name: str
-    method: Method
+    method: SolverSettings
     prepare: Callable[[Spot, Survey], tuple[Spot, Survey]] | None = None
     beyond: bool = False
 
@@ -61,13 +61,13 @@ def _floor_taken_off(spot: Spot, sheet: Survey) -> tuple[Spot, Survey]:
 PLAIN: Final = "ls: the paper's Eq. 4"
 OURS: Final = "ml: weighted, with floor (ours)"
 CONTESTANTS: Final = (
-    Contestant(PLAIN, Method(Solver.LS, rim=0.0)),
-    Contestant("lin: linear differences", Method(Solver.LIN, rim=0.0)),
-    Contestant("ml without weights and floor", Method(Solver.ML, doubt=IGNORANT, rim=0.0), _no_floor_known),
-    Contestant("ls with the floor taken off", Method(Solver.LS, rim=0.0), _floor_taken_off),
-    Contestant(OURS, Method(Solver.ML, doubt=DOUBT)),
-    Contestant("ls, lamps out of view too", Method(Solver.LS, rim=0.0), beyond=True),
-    Contestant("ml (ours), lamps out of view too", Method(Solver.ML, doubt=DOUBT), beyond=True),
+    Contestant(PLAIN, SolverSettings(Solver.LS, rim=0.0)),
+    Contestant("lin: linear differences", SolverSettings(Solver.LIN, rim=0.0)),
+    Contestant("ml without weights and floor", SolverSettings(Solver.ML, doubt=IGNORANT, rim=0.0), _no_floor_known),
+    Contestant("ls with the floor taken off", SolverSettings(Solver.LS, rim=0.0), _floor_taken_off),
+    Contestant(OURS, SolverSettings(Solver.ML, doubt=DOUBT)),
+    Contestant("ls, lamps out of view too", SolverSettings(Solver.LS, rim=0.0), beyond=True),
+    Contestant("ml (ours), lamps out of view too", SolverSettings(Solver.ML, doubt=DOUBT), beyond=True),
 )
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from estimator.calibration.calibrate import calibrate_lamps
 from estimator.light_filter.survey import Survey
-from estimator.paper.lateration import Doubt, Method, Received, Solver, locate
+from estimator.paper.lateration import Doubt, Received, Solver, SolverSettings, locate
 from tools.experiments.report import Cell, Table, Work
 from tools.experiments.static import PRIORS, halves, nominal, rows_of, unit_of
 from tools.experiments.vlp import CAMPAIGNS, Campaign, campaign
@@ -56,7 +56,7 @@ def trial(job: tuple[str, int | None]) -> Array:
             for s, (solver, survey) in enumerate(surveys.items()):
                 received = Received(survey.lamps, a, (NOISE * a) ** 2)
                 for k, n in enumerate(LINKS):
-                    located = locate(received, survey, Method(solver, n, doubt=DOUBT, rim=0.0))
+                    located = locate(received, survey, SolverSettings(solver, n, doubt=DOUBT, rim=0.0))
                     if located.places:
                         found[s, k, i] = np.hypot(*(located.places[0].xy - data.places[place, :2]))
         parts.append(found)
