@@ -12,8 +12,8 @@ import pytest
 from daemon.cli import parser
 from estimator.paper import METHODS
 from tests.daemon.cli.test_replay import RESULTS
-from tests.daemon.replay.room import Drive, carmen, drive, read_tum, relative
 from tests.daemon.commissioning.recorded_drive import record
+from tests.daemon.replay.room import Drive, carmen, drive, read_tum, relative
 from tools.sim.scene import SimulatedScene
 
 SECONDS = 16.0
