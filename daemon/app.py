@@ -231,11 +231,11 @@ class Daemon:
     def _autosaver(self, settings: Config, lights: Lights | None, snapshots: SnapshotBuilder) -> MapAutosaver:
         survey = "" if lights is None else digest_of(lights.survey)
         about = About(settings.name, survey, settings.map.localise)
-        environment, estimator = self._environment, self._estimator
+        environment, runner = self._environment, self._estimator
         return MapAutosaver(
             environment.store,
             environment.start,
-            lambda: estimator.state,
+            lambda: runner.state,
             lambda: snapshots.map_id,
             about,
             environment.clock,
@@ -244,13 +244,13 @@ class Daemon:
     def _map_switch(self, lights: Lights | None, pending: PendingSwitch) -> MapSwitch:
         keep = None if self._recorder is None else self._recorder.keep_switch
         maps = Maps(self._environment.store, judge_for(lights), self._estimator.made, keep)
-        estimator, autosaver = self._estimator, self.autosaver
+        runner, autosaver = self._estimator, self.autosaver
 
         def put(switch: Switch | None, taken: Callable[[], None]) -> None:
             """The cycle takes it over (None: does not after all); the autosaver has it at the same instant."""
 
             def take_over(switch: Switch) -> tuple[int, str]:
-                estimator.take_over(switch)
+                runner.take_over(switch)
                 autosaver.switched(switch.map_id, switch.start)
                 taken()
                 return switch.map_id, switch.sha256

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import estimator
 from daemon.config.survey_loader import write_survey
 from daemon.devices.light_setup import Lights
 from daemon.runtime.warmup import load
@@ -88,13 +89,27 @@ def imported_inside_functions() -> set[str]:
     for file in (ROOT / "daemon").rglob("*.py"):
         bodies = [one for one in ast.walk(ast.parse(file.read_text())) if isinstance(one, DEFINITIONS)]
         for line in (line for body in bodies for line in ast.walk(body)):
-            if isinstance(line, ast.ImportFrom) and line.module:
+            if isinstance(line, ast.ImportFrom) and line.module == "estimator":
+                found |= {exporter(one.name) for one in line.names}
+            elif isinstance(line, ast.Attribute) and ast.unparse(line.value) == "estimator":
+                found.add(exporter(line.attr))
+            elif isinstance(line, ast.ImportFrom) and line.module:
                 found |= {line.module, *(f"{line.module}.{one.name}" for one in line.names)}
             elif isinstance(line, ast.Import):
                 found |= {one.name for one in line.names}
             elif isinstance(line, ast.Call) and ast.unparse(line.func) == "import_module":
                 found |= {str(one.value) for one in line.args if isinstance(one, ast.Constant)}
     return {name for name in found if name.startswith(("daemon.", "estimator.")) and is_module(name)}
+
+
+def exporter(name: str) -> str:
+    """The module that is loaded where a name that the estimator exports is used."""
+    return next(
+        f"estimator.{module}" if module else f"estimator.{path}"
+        for module, names in estimator.NAMES_OF.items()
+        for path in names.split()
+        if path.rpartition(".")[2] == name
+    )
 
 
 def is_module(name: str) -> bool:
