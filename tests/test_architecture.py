@@ -29,18 +29,9 @@ MAY_IMPORT = {
 
 ORDER = {
     "estimator": (
-        *(
-            "lazy_exports",
-            "numerics",
-            "measurements",
-            "cdma",
-            "result",
-            "light_filter",
-            "scan_matching",
-            "fusion",
-            "mapping",
-        ),
-        *("relocalisation", "commands", "state", "pipeline", "calibration", "paper"),
+        *("lazy_exports", "numerics", "cdma", "measurements", "result", "job_queue", "light_filter", "scan_matching"),
+        *("fusion", "mapping", "relocalisation", "state", "stored_map", "match_entry", "commands", "pipeline"),
+        *("calibration", "paper"),
     ),
     "hal": (
         *("errors", "clock", "blocking_calls", "timerfd", "run_server", "lidar", "adc", "odometry", "imu"),
@@ -50,7 +41,7 @@ ORDER = {
         *("system", "config", "snapshot", "health", "devices", "maps", "integrity", "runtime", "recording"),
         *("publish", "environment", "app", "replay", "diagnosis", "commissioning", "cli", "__main__"),
     ),
-    "taps": ("stream", "access_guard", "zenoh_session", "ros", "foxglove", "mcap", "view", "metrics", "fleet"),
+    "taps": ("stream", "access_guard", "command_client", "zenoh_session", "ros", "foxglove", "mcap", "view", "metrics", "fleet"),
     "tools": ("ci", "clients", "sim", "convert", "relations", "demo", "bench", "experiments", "soak", "docs"),
 }
 """The entries of each room in order. A module imports from its own entry and from those to its left.
