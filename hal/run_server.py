@@ -33,15 +33,15 @@ async def until_stopped(seconds: float = 0.0) -> None:
 
 async def run_until_stopped(*works: Coroutine[Any, Any, None], seconds: float = 0.0) -> None:
     """Run ``works`` until :func:`until_stopped` returns; the first failure cancels all and is raised here."""
-    told = asyncio.create_task(until_stopped(seconds))
+    stopped = asyncio.create_task(until_stopped(seconds))
     tasks = [asyncio.create_task(work) for work in works]
     try:
-        pending = {told, *tasks}
-        while told in pending:
+        pending = {stopped, *tasks}
+        while stopped in pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
     finally:
-        for task in (told, *tasks):
+        for task in (stopped, *tasks):
             task.cancel()
-        await asyncio.gather(told, *tasks, return_exceptions=True)
+        await asyncio.gather(stopped, *tasks, return_exceptions=True)

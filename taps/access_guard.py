@@ -56,7 +56,7 @@ class Guard:
         return is_loopback(self.bind)
 
     @property
-    def looks_need_token(self) -> bool:
+    def watching_needs_token(self) -> bool:
         """Whether watching requires the token."""
         return not self.local
 
@@ -80,11 +80,11 @@ class Guard:
             return False
         return hmac.compare_digest(token.encode(), self.token.encode())
 
-    def may_look(self, token: object) -> bool:
+    def may_watch(self, token: object) -> bool:
         """Whether this token permits watching."""
         return self.local or self.token_ok(token)
 
-    def may_order(self, token: object) -> bool:
+    def may_command(self, token: object) -> bool:
         """Whether this token permits commands."""
         return self.write and self.token_ok(token)
 

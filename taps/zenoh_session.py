@@ -71,7 +71,7 @@ def session_config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.
     """
     side = "connect" if mode == "client" else "listen"
     try:
-        made = zenoh.Config() if file is None else zenoh.Config.from_file(file)
+        result = zenoh.Config() if file is None else zenoh.Config.from_file(file)
         for key, value in {
             "mode": mode,
             f"{side}/endpoints": [locator(endpoint)],
@@ -82,20 +82,20 @@ def session_config(mode: str, endpoint: str, file: Path | None = None) -> zenoh.
             "transport/link/tx/lease": round(1e3 * LEASE_S),
             "transport/unicast/open_timeout": round(1e3 * LEASE_S),
         }.items():
-            made.insert_json5(key, json.dumps(value))
-        _check_files(made)
+            result.insert_json5(key, json.dumps(value))
+        _check_files(result)
     except zenoh.ZError as error:
         raise BadEndpoint(f"{endpoint if file is None else f'{endpoint}, {file}'}: {error_text(error)}") from None
-    return made
+    return result
 
 
-def _check_files(made: zenoh.Config) -> None:
+def _check_files(result: zenoh.Config) -> None:
     """Check that certificates and keys exist and are PEM: Zenoh reports only a failed connection.
 
     Raises:
         BadEndpoint: one is missing or invalid.
     """
-    for key, path in json.loads(made.get_json("transport/link/tls")).items():
+    for key, path in json.loads(result.get_json("transport/link/tls")).items():
         if isinstance(path, str) and key.endswith(("certificate", "private_key")):
             try:
                 content = Path(path).read_bytes()
@@ -119,11 +119,11 @@ async def open_session(router: str, file: Path | None = None, say: Say = console
     Raises:
         BadEndpoint: an invalid endpoint or file.
     """
-    made = session_config("client", router, file)
+    result = session_config("client", router, file)
     reported = False
     while True:
         try:
-            session = await run_in_thread(partial(zenoh.open, made), "zenoh")
+            session = await run_in_thread(partial(zenoh.open, result), "zenoh")
             break
         except zenoh.ZError as error:
             if not reported:
@@ -142,15 +142,15 @@ async def open_session(router: str, file: Path | None = None, say: Say = console
 
 async def watch_router(session: zenoh.Session, router: str, on_router: OnRouter, say: Say = console.say) -> None:
     """Report loss and return of the router until cancelled; ``on_router`` receives its presence, also at the start."""
-    there = True
+    present = True
     on_router(True)
     while True:
         await asyncio.sleep(POLL_S)
-        if bool(session.info.routers_zid()) == there:
+        if bool(session.info.routers_zid()) == present:
             continue
-        there = not there
-        say(f"the router at {router} is back" if there else f"the router at {router} has gone; waiting for it")
-        on_router(there)
+        present = not present
+        say(f"the router at {router} is back" if present else f"the router at {router} has gone; waiting for it")
+        on_router(present)
 
 
 async def list_tokens(session: zenoh.Session, key: str) -> list[str]:
@@ -164,13 +164,13 @@ async def query_all(
 ) -> list[tuple[str, bytes, bytes]]:
     """The first ``most`` replies of all queryables: key, content, attachment."""
 
-    def ask() -> list[tuple[str, bytes, bytes]]:
+    def get() -> list[tuple[str, bytes, bytes]]:
         replies = session.get(
             key, target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE, timeout=seconds
         )
         return [sample_parts(reply.ok) for reply in islice(replies, most) if reply.ok is not None]
 
-    return await run_in_thread(ask, "zenoh")
+    return await run_in_thread(get, "zenoh")
 
 
 class Declared(Protocol):

@@ -41,7 +41,10 @@ ORDER = {
         *("system", "config", "snapshot", "health", "devices", "maps", "integrity", "runtime", "recording"),
         *("publish", "environment", "app", "replay", "diagnosis", "commissioning", "cli", "__main__"),
     ),
-    "taps": ("stream", "access_guard", "command_client", "zenoh_session", "ros", "foxglove", "mcap", "view", "metrics", "fleet"),
+    "taps": (
+        *("stream", "access_guard", "command_client", "zenoh_session", "ros", "foxglove", "mcap", "view", "metrics"),
+        "fleet",
+    ),
     "tools": ("ci", "clients", "sim", "convert", "relations", "demo", "bench", "experiments", "soak", "docs"),
 }
 """The entries of each room in order. A module imports from its own entry and from those to its left.

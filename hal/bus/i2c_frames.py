@@ -111,7 +111,7 @@ class _Reader:
         self._at = end
         return values
 
-    def take(self, length: int) -> bytes:
+    def read(self, length: int) -> bytes:
         data = self._body[self._at : self._at + length]
         if len(data) < length:
             raise BadFrame("a body that is too short")
@@ -120,7 +120,7 @@ class _Reader:
 
     def counted(self) -> bytes:
         (length,) = self.unpack(_SHORT)
-        return self.take(length)
+        return self.read(length)
 
     def text(self) -> str:
         try:
@@ -166,15 +166,15 @@ def parse_hello(body: bytes) -> Hello:
 
 
 def refused(error: HalError) -> bytes:
-    """The frame that says why there is no bus."""
+    """The REFUSED frame of an error."""
     kind = next((code for code, cls in ERRORS.items() if isinstance(error, cls)), 3)
     return frame(REFUSED, bytes([kind]) + _text(error.problem) + _text(error.remedy))
 
 
 def parse_refused(body: bytes, device: str) -> HalError:
-    """Read a REFUSED as the error it stands for, told of ``device``; raises `BadFrame`."""
+    """Parse a REFUSED frame to the error of ``device``; raises `BadFrame`."""
     reader = _Reader(body)
-    kind = ERRORS.get(reader.take(1)[0])
+    kind = ERRORS.get(reader.read(1)[0])
     if kind is None:
         raise BadFrame("an unknown kind of error")
     error = kind(device, reader.text(), reader.text())
@@ -200,7 +200,7 @@ def parse_transfer(body: bytes) -> tuple[int, tuple[Message, ...]]:
         address, flags, length = reader.unpack(_MESSAGE)
         if flags > 1:
             raise BadFrame(f"message flags {flags:#x}")
-        messages.append(Message(address, length=length) if flags else Message(address, reader.take(length)))
+        messages.append(Message(address, length=length) if flags else Message(address, reader.read(length)))
     reader.end()
     return number, tuple(messages)
 

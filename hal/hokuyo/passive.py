@@ -54,7 +54,7 @@ class PassiveHokuyo:
         return self._status
 
     def restart(self) -> None:
-        """Start anew: the next bytes belong to another connection (a gap in the recording)."""
+        """Restart: the next bytes belong to another connection (a gap in the recording)."""
         self._splitter.reset()
         self._stream = None
 

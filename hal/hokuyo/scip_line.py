@@ -21,7 +21,7 @@ class Line:
     Attributes:
         on_frame: receives every frame but the awaited reply, with its arrival time; None: dropped.
         recognised: frames with a valid status line so far; distinguishes a right line rate from a wrong one.
-        first_bytes: the first bytes received, valid or not; collected anew after it was emptied.
+        first_bytes: the first bytes received, valid or not; collected again after it was emptied.
     """
 
     def __init__(self, port: Port) -> None:

@@ -3,7 +3,7 @@
 A sensor may be idle, streaming (a serial sensor does not notice the loss of its host), in time-adjust mode, still in
 SCIP 1.1, at another line rate, in the middle of a frame, booting, or in its error state. The steps through all of them:
 
-    settle    QT until it is acknowledged; on the way TM2 out of time adjustment, ``SCIP2.0`` out of SCIP 1.1
+    settle    QT until it is acknowledged; meanwhile TM2 out of time adjustment, ``SCIP2.0`` out of SCIP 1.1
     reset     RT or RS, only after failures
     identify  VV, PP, II
     set_rate  RS-232 only
@@ -102,9 +102,9 @@ class Session:
                 return reply
         if self.line.is_foreign:
             raise self.foreign_device(self.line.first_bytes)
-        heard = _UNREADABLE if self.line.dropped_bytes else "nothing answers"
+        problem = _UNREADABLE if self.line.dropped_bytes else "nothing answers"
         remedy = "is another client connected? it serves one" if self.device.startswith("tcp:") else _NO_ANSWER
-        raise DeviceFault(self.device, heard, remedy)
+        raise DeviceFault(self.device, problem, remedy)
 
     def foreign_device(self, first: bytes) -> DeviceFault:
         """The error for a device that sends other bytes than SCIP; it quotes them, to help identify the device.

@@ -32,7 +32,7 @@ class Verdict:
     """The result for the latest block and those before it.
 
     Attributes:
-        sound: the chip can have sent this block. error: the present condition. again: identify the chip anew.
+        sound: the chip can have sent this block. error: the present condition. again: identify the chip again.
     """
 
     sound: bool

@@ -87,7 +87,7 @@ async def probe_bus(opener: BusOpener, name: str) -> BusFinding:
     chips: list[Chip] = []
     try:
         for address in ADDRESSES:
-            chip = await _look(bus, address)
+            chip = await _probe_address(bus, address)
             if chip is not None:
                 chips.append(chip)
     except OSError as error:
@@ -97,7 +97,7 @@ async def probe_bus(opener: BusOpener, name: str) -> BusFinding:
     return BusFinding(name, bus.about, tuple(chips))
 
 
-async def _look(bus: AsyncBus, address: int) -> Chip | None:
+async def _probe_address(bus: AsyncBus, address: int) -> Chip | None:
     """The chip at an address; None: none. Raises `OSError` where the bus itself is at fault."""
     try:
         await bus.transfer((read(address, 2),))
@@ -107,8 +107,8 @@ async def _look(bus: AsyncBus, address: int) -> Chip | None:
             raise
         if error.errno in NACKS or error.errno == errno.EIO:
             return None
-        taken = "in use by another program, or by a kernel driver; end or unbind it to look"
-        return Chip(address, problem=taken if error.errno == errno.EBUSY else os.strerror(error.errno or 0))
+        busy = "in use by another program, or by a kernel driver; end or unbind it to look"
+        return Chip(address, problem=busy if error.errno == errno.EBUSY else os.strerror(error.errno or 0))
 
 
 async def _identify(bus: AsyncBus, address: int) -> Chip:

@@ -35,10 +35,15 @@ class Claim:
     """
 
     def __init__(
-        self, session: zenoh.Session, robot: str, host: str, on_change: Callable[[bool], None], say: Say = console.say
+        self,
+        session: zenoh.Session,
+        robot: str,
+        host: str,
+        on_change: Callable[[bool], None],
+        report: Say = console.say,
     ) -> None:
         self.mine = False
-        self._session, self._robot, self._host, self._on_change, self._say = session, robot, host, on_change, say
+        self._session, self._robot, self._host, self._on_change, self._report = session, robot, host, on_change, report
         self._others: dict[str, bool] = {}  # whether it is present
         self._token: zenoh.LivelinessToken | None = None
         self._instance = ""
@@ -56,7 +61,7 @@ class Claim:
                 self._alone = self._alone + POLL_S if free else 0.0
                 if self.mine and not self._reported and self._alone >= SURE_S:
                     self._reported = True
-                    self._say(f"{self._robot} is in the fleet")
+                    self._report(f"{self._robot} is in the fleet")
                 elif self._alone >= ALONE_S and not self.mine:
                     self._settle(True)
         finally:
@@ -70,25 +75,25 @@ class Claim:
         loop = asyncio.get_running_loop()
 
         def on_token(sample: zenoh.Sample) -> None:
-            there = sample.kind == zenoh.SampleKind.PUT
+            present = sample.kind == zenoh.SampleKind.PUT
             instance = str(sample.key_expr).rpartition("/")[2]
             with contextlib.suppress(RuntimeError):  # the loop has closed
-                loop.call_soon_threadsafe(self._on_claim, instance, there)
+                loop.call_soon_threadsafe(self._on_claim, instance, present)
 
         # before the list is queried: a claimant that leaves meanwhile would stay in it
         self._subscriber = self._session.liveliness().declare_subscriber(everybody, on_token, history=True)
         for name in await list_tokens(self._session, everybody):
             self._others.setdefault(name.rpartition("/")[2], True)
-        there = [one for one, is_there in self._others.items() if is_there]
-        claimed = max([messages.now_ms(), *(messages.claimed_of(one) + 1 for one in there)])
+        present = [one for one, is_present in self._others.items() if is_present]
+        claimed = max([messages.now_ms(), *(messages.claimed_of(one) + 1 for one in present)])
         self._instance = messages.instance_of(str(self._session.info.zid()), self._host, claimed)
         self._settle(not self._before())
 
-    def _on_claim(self, instance: str, there: bool) -> None:
+    def _on_claim(self, instance: str, present: bool) -> None:
         if instance == self._instance:
             return
-        if there or not self._instance:  # the pending list must not restore a claimant that has left
-            self._others[instance] = there
+        if present or not self._instance:  # the pending list must not restore a claimant that has left
+            self._others[instance] = present
         else:
             self._others.pop(instance, None)
         if self.mine and self._before():
@@ -96,7 +101,7 @@ class Claim:
 
     def _before(self) -> str:
         """The claimant with precedence over this one; empty: none."""
-        first = min((one for one, there in self._others.items() if there), default="")
+        first = min((one for one, present in self._others.items() if present), default="")
         return first if first and first < self._instance else ""
 
     def _settle(self, mine: bool) -> None:
@@ -105,7 +110,7 @@ class Claim:
         self._put(messages.alive if mine else messages.waiting)
         if not mine:
             self._reported = False
-            self._say(
+            self._report(
                 f"the fleet has a robot {self._robot} already, on {messages.host_of(self._before())}; this one, on "
                 f"{self._host}, tells nothing until that one has gone: give one of them another `name`"
             )

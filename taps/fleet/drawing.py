@@ -36,8 +36,8 @@ HEADS: Final = ("", "robot", "state", "x m", "y m", "deg", "bound m", "map", "su
 
 def table(members: Sequence[Member], now: float) -> list[str]:
     """The table of robots: a header and a line for each."""
-    told = (_row(label_of(k), member, now) for k, member in enumerate(members))
-    rows = [HEADS, *(tuple(printable(cell[:WIDEST]) for cell in row) for row in told)]
+    cells = (_row(label_of(k), member, now) for k, member in enumerate(members))
+    rows = [HEADS, *(tuple(printable(cell[:WIDEST]) for cell in row) for row in cells)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(HEADS))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
@@ -55,13 +55,13 @@ def _row(label: str, member: Member, now: float) -> tuple[str, ...]:
     at = (member.pose.agvPosition if member.pose is not None else None) or {}
     bound = number(at.get("deviationRange"))
     survey = None if state is None else state.held.get("survey")
-    said = "GONE" if not member.publishers else "?" if state is None else state.state_name
+    legend = "GONE" if not member.publishers else "?" if state is None else state.state_name
     faults = () if state is None else state.faults
     words = "; ".join(f"{one.fault} {one.meaning}" for one in faults) or ("" if state is None else state.meaning)
     return (
         label,
         member.name,
-        said,
+        legend,
         x,
         y,
         theta,
@@ -98,8 +98,8 @@ def plan(chart: Chart, members: Sequence[Member], wide: int = 100, high: int = 3
     at_row, first_row = _starts(last - first, TALL * step)
     at_column, first_column = _starts(right - left, step)
     for shade, letter in ((FREE, "."), (WALL, "#")):  # a wall takes precedence over free cells
-        there = np.logical_or.reduceat(np.logical_or.reduceat(cells == shade, first_row, 0), first_column, 1)
-        text[np.ix_(at_row, at_column)] = np.where(there, letter, text[np.ix_(at_row, at_column)])
+        occupied = np.logical_or.reduceat(np.logical_or.reduceat(cells == shade, first_row, 0), first_column, 1)
+        text[np.ix_(at_row, at_column)] = np.where(occupied, letter, text[np.ix_(at_row, at_column)])
     for k, _, row, column in robots:
         y, x = int((row - first) / (TALL * step)), int((column - left) / step)
         if 0 <= y < rows and 0 <= x < columns:
@@ -118,15 +118,15 @@ def picture(chart: Chart, members: Sequence[Member]) -> tuple[npt.NDArray[np.uin
     for shade in (FREE, WALL):
         shades[cells == shade] = SHADES[shade]
     pixels = shades.repeat(scale, axis=0).repeat(scale, axis=1)
-    said = []
+    legend = []
     for k, member, row, column in on_chart(chart, members):
         name, colour = COLOURS[k % len(COLOURS)]
-        said.append(f"{printable(member.name)} {name}" + ("" if member.localised else " (where it was last)"))
+        legend.append(f"{printable(member.name)} {name}" + ("" if member.localised else " (where it was last)"))
         _disc(pixels, scale * row, scale * column, colour)
         assert member.place is not None
         nose = 1.6 * DISC_PX * np.array((math.sin(member.place[2]), math.cos(member.place[2])))
         _disc(pixels, scale * row + nose[0], scale * column + nose[1], colour, DISC_PX // 3)
-    return pixels[::-1], said
+    return pixels[::-1], legend
 
 
 def _seen(cells: Cells) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -87,7 +87,7 @@ class Fetcher:
             session.liveliness().declare_subscriber(
                 f"{SHARED}/alive/*", lambda sample: loop.call_soon_threadsafe(news.set), history=True
             )
-            watching = asyncio.create_task(watch_router(session, args.router, lambda there: news.set()))
+            watching = asyncio.create_task(watch_router(session, args.router, lambda present: news.set()))
             try:
                 while True:
                     news.clear()

@@ -70,7 +70,7 @@ async def join(args: argparse.Namespace, stream: Stream) -> None:
         works = [
             asyncio.create_task(work)
             for work in (
-                watch_router(session, args.router, lambda there: None),
+                watch_router(session, args.router, lambda present: None),
                 claim.run(),
                 beat(robot, args.rate),
                 follow(stream, robot),
@@ -136,7 +136,7 @@ class Robot:
         self._lost = False
         self._last_state: StateMessage | None = None
         self._name: tuple[int, str] = 0, ""
-        self._looked = 0.0
+        self._t_searched = 0.0
 
     def receive(self, frame: Frame | Lost) -> None:
         """Process one stream message; loop closures are published at once."""
@@ -183,14 +183,14 @@ class Robot:
             self._draw()
 
     def _publish_pose(self, pose: Pose) -> None:
-        told = PoseMessage(
+        message = PoseMessage(
             seq=pose.seq,
             t_utc=pose.utc(pose.t_mono),
             agvPosition=position_v2(pose, self._held, self._map_name(pose.map_id)),
             velocity=pose.velocity,
             covariance=pose.covariance,
         )
-        self._publisher.publish("pose", messages.encode(told))
+        self._publisher.publish("pose", messages.encode(message))
 
     def _state(self, hangs: bool) -> StateMessage:
         if self._pose is None or hangs:
@@ -203,8 +203,8 @@ class Robot:
     def _map_name(self, map_id: int) -> str:
         """Name of the map in its file; a missing one is searched for again."""
         now = time.monotonic()
-        if self._name[0] != map_id or (not self._name[1] and now - self._looked >= NAME_S):
-            self._name, self._looked = (map_id, name_of(self._folder, map_id)), now
+        if self._name[0] != map_id or (not self._name[1] and now - self._t_searched >= NAME_S):
+            self._name, self._t_searched = (map_id, name_of(self._folder, map_id)), now
         return self._name[1]
 
     def _draw(self) -> None:

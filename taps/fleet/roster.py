@@ -69,7 +69,7 @@ class Member:
     problem: str = ""
 
     @property
-    def there(self) -> bool:
+    def present(self) -> bool:
         """Whether any claimant of its name is present."""
         return bool(self.publishers or self.waiting)
 
@@ -130,20 +130,20 @@ class Roster:
         except Unreadable as error:
             member.problem = f"{words[2]}: {error}"
 
-    def token(self, key: str, there: bool) -> str:
+    def token(self, key: str, present: bool) -> str:
         """Process a liveliness token that appears or vanishes; returns the robot of a new publisher, else ""."""
         words = key.split("/")
         if len(words) != 4 or words[0] != messages.ROOT or words[2] not in ("alive", "waiting"):
             return ""
-        member = self._member(words[1]) if there else self.members.get(words[1])
+        member = self._member(words[1]) if present else self.members.get(words[1])
         if member is None:
             return ""
         instances = member.publishers if words[2] == "alive" else member.waiting
-        if not there:
+        if not present:
             instances.discard(words[3])
         elif len(instances) < MOST_INSTANCES:
             instances.add(words[3])
-        return member.name if there and words[2] == "alive" else ""
+        return member.name if present and words[2] == "alive" else ""
 
     def drop_absent(self, now: float, router: bool) -> None:
         """Remove long absent robots; without a router none counts as absent.
@@ -151,7 +151,7 @@ class Roster:
         Call it after each display: the note about a full roster appears once.
         """
         for member in list(self.members.values()):
-            if member.there or not router:
+            if member.present or not router:
                 member.t_present = now
             elif now - member.t_last > GONE_S:
                 del self.members[member.name]
@@ -193,7 +193,7 @@ class Roster:
         return [printable(line) for line in found]
 
     def chart(self) -> Chart | None:
-        """The map with most robots, from the robot that knows most of it."""
+        """The map with most robots, from the robot with most of it."""
         count: dict[str, int] = {}
         for member in self.members.values():
             count[member.map_id] = count.get(member.map_id, 0) + 1
@@ -223,7 +223,7 @@ class Roster:
             return member
         if len(self.members) >= MOST_ROBOTS:
             gone = min(
-                (one for one in self.members.values() if not one.there), key=lambda one: one.t_last, default=None
+                (one for one in self.members.values() if not one.present), key=lambda one: one.t_last, default=None
             )
             if gone is None:
                 self._full = True

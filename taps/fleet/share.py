@@ -55,7 +55,7 @@ async def share(args: argparse.Namespace, offers: list[tuple[Offer, bytes]]) -> 
         try:
             for offer, _ in offers:
                 console.say(f"{offer.label()}, {offer.size} bytes, SHA-256 {offer.sha256}")
-            await watch_router(session, args.router, lambda there: None)
+            await watch_router(session, args.router, lambda present: None)
         finally:
             undeclare(token)  # keeps a reference: the library undeclares unreferenced tokens
 

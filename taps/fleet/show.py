@@ -76,12 +76,12 @@ async def show(args: argparse.Namespace, roster: Roster) -> None:
         try:
             await asyncio.sleep(ONCE_S)
             while True:
-                text = render(args, roster, collector.there)
+                text = render(args, roster, collector.present)
                 sys.stdout.write((CLEAR if args.watch and sys.stdout.isatty() and not args.json else "") + text)
                 sys.stdout.flush()
                 if not args.watch:
                     return
-                roster.drop_absent(time.monotonic(), collector.there)
+                roster.drop_absent(time.monotonic(), collector.present)
                 await asyncio.sleep(1.0)
         finally:
             watching.cancel()
@@ -96,7 +96,7 @@ class Collector:
     """
 
     def __init__(self, session: zenoh.Session, roster: Roster) -> None:
-        self.there = True
+        self.present = True
         self._session, self._roster = session, roster
         self._loop = asyncio.get_running_loop()
         self._queries: dict[str, asyncio.Task[None]] = {}
@@ -107,10 +107,10 @@ class Collector:
         for kind in ("alive", "waiting"):
             session.liveliness().declare_subscriber(f"{messages.ROOT}/*/{kind}/*", self._token, history=True)
 
-    def on_router(self, there: bool) -> None:
+    def on_router(self, present: bool) -> None:
         """Set the presence of the router."""
-        self.there = there
-        if not there:
+        self.present = present
+        if not present:
             self._roster.without_router()
 
     def _call(self, function: object, *args: object) -> None:
@@ -134,8 +134,8 @@ class Collector:
     def _token(self, sample: zenoh.Sample) -> None:
         self._call(self._on_token, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-    def _on_token(self, key: str, there: bool) -> None:
-        robot = self._roster.token(key, there)
+    def _on_token(self, key: str, present: bool) -> None:
+        robot = self._roster.token(key, present)
         if robot and robot not in self._queries and len(self._queries) < MOST_ROBOTS:
             self._queries[robot] = task = asyncio.create_task(self._query(robot))
             task.add_done_callback(lambda _: self._queries.pop(robot))
@@ -147,7 +147,7 @@ class Collector:
                 self._roster.receive(*found, time.monotonic())
 
 
-def render(args: argparse.Namespace, roster: Roster, there: bool) -> str:
+def render(args: argparse.Namespace, roster: Roster, present: bool) -> str:
     """Render the fleet as text or JSON, and write the picture."""
     members, chart, now = roster.sorted(), roster.chart(), time.monotonic()
     if args.json:
@@ -160,7 +160,7 @@ def render(args: argparse.Namespace, roster: Roster, there: bool) -> str:
             }
             for one in members
         }
-        return msgspec.json.encode({"router": there, "robots": robots, "problems": roster.problems()}).decode() + "\n"
+        return msgspec.json.encode({"router": present, "robots": robots, "problems": roster.problems()}).decode() + "\n"
     lines = drawing.table(members, now)
     if chart is not None:
         size = shutil.get_terminal_size((100, 50))
@@ -171,5 +171,5 @@ def render(args: argparse.Namespace, roster: Roster, there: bool) -> str:
             lines.append(f"{args.picture}: {', '.join(legend) or 'no robot is in that map'}")
     elif args.picture is not None:
         lines.append(f"{args.picture}: not written, no robot has told a map yet")
-    lines += [] if there else [f"the router at {args.router} has gone: this is what was told last"]
+    lines += [] if present else [f"the router at {args.router} has gone: this is what was told last"]
     return "\n".join([*lines, *roster.problems()]) + "\n"

@@ -92,7 +92,7 @@ def exposition(latest: Latest, now: float) -> str:
 
 def _families(latest: Latest, now: float) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
     alive = latest.alive(now)
-    yield "lumiloop_up", "gauge", "whether the daemon alive", [({}, float(alive))]
+    yield "lumiloop_up", "gauge", "whether the daemon answers", [({}, float(alive))]
     if not alive:
         return
     if latest.hello is not None:
@@ -123,7 +123,7 @@ def _of_pose(pose: Pose, now: float) -> Iterator[tuple[str, str, str, Iterable[S
         sigma = [({"axis": "x"}, math.sqrt(xx)), ({"axis": "y"}, math.sqrt(yy))]
         yield "lumiloop_pose_sigma_metres", "gauge", "its deviation", sigma
         yield "lumiloop_pose_sigma_yaw_radians", "gauge", "that of its heading", [({}, math.sqrt(turn))]
-    known = [({"axis": axis}, float(so)) for axis, so in zip(("x", "y", "yaw"), pose.known, strict=True)]
+    known = [({"axis": axis}, float(observed)) for axis, observed in zip(("x", "y", "yaw"), pose.known, strict=True)]
     yield "lumiloop_axis_known", "gauge", "whether an axis is observed", known
     if pose.trust.horizontal_m is not None:
         level: list[Sample] = [({}, pose.trust.horizontal_m)]

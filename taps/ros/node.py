@@ -60,7 +60,7 @@ async def serve(args: argparse.Namespace, namespace: str, stream: Stream) -> Non
         if await list_tokens(session, node.others()):
             raise NameTaken(name_taken(node))
         publisher = RosPublisher(session, node, args.humble)
-        watching = asyncio.create_task(watch_router(session, args.router, lambda there: None))
+        watching = asyncio.create_task(watch_router(session, args.router, lambda present: None))
         work = [asyncio.create_task(wait_for_rival(session, node))]
         try:
             console.say(f"node {namespace}/{NAME} in domain {node.domain} by way of {args.router}")

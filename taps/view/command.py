@@ -129,7 +129,7 @@ def _record(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], ou
 
 def _wait(film: ReplayFile) -> None:
     """Wait until the recording has proved readable."""
-    console.say("replaying the recording; it can be watch_router meanwhile")
+    console.say("replaying the recording; it can be watched meanwhile")
     while film.scene is None and not film.done:
         time.sleep(0.05)
         film.refresh()

@@ -158,7 +158,7 @@ class View:
         if token is not None and not self._guard.token_ok(token):
             async with self._guesses:
                 await asyncio.sleep(WRONG_TOKEN_S)
-        if not self._guard.may_look(token):
+        if not self._guard.may_watch(token):
             await _refuse(socket, "token", "This page is shown to those who have its token.")
             return None
         if len(self._sockets) >= VIEWERS:
@@ -166,7 +166,7 @@ class View:
             return None
         self._sockets.add(socket)
         self._count += 1
-        viewer = Viewer(self._count, self._guard.may_order(token) and self._film is None)
+        viewer = Viewer(self._count, self._guard.may_command(token) and self._film is None)
         recording = None if self._film is None else self._film.source
         item = welcome(self._scene, self.page, viewer.order, recording)
         item |= {"you": viewer.number, "wrong_token": token is not None and not self._guard.token_ok(token)}
@@ -230,8 +230,8 @@ class View:
                 self.hub.disconnected(str(error))
                 log.error("%s", error)
             except Exception:  # an internal error: the page shows it and continues
-                self.hub.disconnected("what the daemon item could not be shown; the log of `lumiloop view` says why")
-                log.exception("what the daemon item could not be shown")
+                self.hub.disconnected("what the daemon told could not be shown; the log of `lumiloop view` says why")
+                log.exception("what the daemon told could not be shown")
             await asyncio.sleep(TRY_AGAIN_S)
 
     def _reload_scene(self) -> None:
@@ -281,7 +281,7 @@ async def _close_on_error(socket: web.WebSocketResponse, work: Coroutine[Any, An
     except ConnectionError:
         log.debug("a browser has gone", exc_info=True)
     except Exception:  # an internal error
-        log.exception("a browser could not be item what it should see")
+        log.exception("a browser could not be told what it should see")
         with contextlib.suppress(ConnectionError, RuntimeError):
             await socket.close(code=WSCloseCode.INTERNAL_ERROR, message=b"the log of `lumiloop view` says why")
 

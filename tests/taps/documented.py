@@ -56,7 +56,7 @@ ELSEWHERE: Final = {
 """The test that runs it, or what it is made of where the whole takes minutes, hours, or the devices of a computer."""
 
 NOT_RUN: Final = {
-    r"README.md: make (venv|test)|data.md: make test": "the tests themselves, and what they run in",
+    r"README.md: make (venv|test|check|quick)|data.md: make test": "the tests themselves, and what they run in",
     r"bench.md: python -m pytest tests/hil": "needs a lidar, a converter, a robot that moves",
     r"bench.md: python -m tools.bench.world (lap cable|lamps)": "needs a USB gadget, a converter from numbers to light",
     r"bench.md: make bench-vm": "an emulated computer: minutes, and root for the first time",

@@ -21,21 +21,21 @@ TOKEN = "0123456789abcdef"
 def test_on_loopback_all_look_and_those_with_the_token_order(bind: str) -> None:
     assert is_loopback(bind)
     guard = Guard(bind, TOKEN, True)
-    assert guard.may_look(None)
-    assert guard.may_order(TOKEN)
+    assert guard.may_watch(None)
+    assert guard.may_command(TOKEN)
     for told in (None, "", TOKEN + "x", TOKEN[:-1], TOKEN.upper(), 1, [TOKEN], "é" * 16):
-        assert not guard.may_order(told)
-    assert not Guard(bind, TOKEN).may_order(TOKEN)  # orders are not taken at all
-    assert not Guard(bind, None, True).may_order(None)
+        assert not guard.may_command(told)
+    assert not Guard(bind, TOKEN).may_command(TOKEN)  # orders are not taken at all
+    assert not Guard(bind, None, True).may_command(None)
 
 
 @pytest.mark.parametrize("bind", ["0.0.0.0", "192.168.1.20", "::", "agv.local", ""])
 def test_elsewhere_the_token_is_needed_to_look(bind: str) -> None:
     assert not is_loopback(bind)
     guard = Guard(bind, TOKEN)
-    assert guard.may_look(TOKEN)
-    assert not guard.may_look(None)
-    assert not Guard(bind).may_look(None)  # a server without one shows nothing at all
+    assert guard.may_watch(TOKEN)
+    assert not guard.may_watch(None)
+    assert not Guard(bind).may_watch(None)  # a server without one shows nothing at all
 
 
 def test_hosts() -> None:

@@ -79,7 +79,7 @@ class Control:
         return [f"ordered {fault}"]
 
 
-def _make_way(path: Path) -> None:
+def _remove_stale_socket(path: Path) -> None:
     if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
         raise DeviceRefused(str(path), "there is something that is no socket", "choose another path")
     path.unlink(missing_ok=True)
@@ -91,7 +91,7 @@ async def serve_control(control: Control, path: Path) -> asyncio.Server:
     Raises:
         DeviceRefused: ``path`` exists and is no socket.
     """
-    _make_way(path)
+    _remove_stale_socket(path)
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(ConnectionError, ValueError), contextlib.closing(writer):  # ValueError: endless line

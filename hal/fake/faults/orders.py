@@ -4,7 +4,7 @@
 
     [[fault]]
     what = "bit_flip"     # a word of the device's vocabulary
-    where = "lidar"       # which device; may be left out while only one knows the word
+    where = "lidar"       # which device; optional where only one has the word
     when = 2.0            # seconds after the schedule starts (after the order, when ordered live)
     for = 1.5             # seconds; without `for` and `count` it lasts until it is cleared
     count = 3             # or: how many times it strikes

@@ -1,4 +1,4 @@
-"""The remote bus: client and server over real unix and TCP sockets."""
+"""The client of a remote bus, over real unix and TCP sockets."""
 
 from __future__ import annotations
 
@@ -6,12 +6,9 @@ import asyncio
 import errno
 import os
 import socket
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,38 +17,13 @@ import pytest
 from hal.adc import RawSamples
 from hal.bus import i2c_frames as frames
 from hal.bus.i2c import read, write
-from hal.bus.i2c_remote import RemoteClock, clock_name, open_remote, parse_address
-from hal.bus.i2c_server import BusServer
+from hal.bus.i2c_remote import RemoteClock, open_remote, parse_address
 from hal.bus.opening import open_bus
 from hal.clock import SystemClock
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
-from hal.fake.adc.converter import FakeAdc, FakeBuses
-from hal.fake.faults.schedule import FaultSchedule
 from hal.photodiode.driver import PhotodiodeAdc
+from tests.hal.bus.remote_bus import KINDS, Server, answer, greet, served
 from tests.hal.photodiode.bench import Bench, Light, falsehoods
-
-KINDS = ("unix", "tcp")
-
-
-def ramp(t_mono: object) -> object:
-    return (t_mono * 5.0) % 1.0  # type: ignore[operator]  # an array
-
-
-@asynccontextmanager
-async def served(kind: str, folder: Path, source: object = ramp) -> AsyncIterator[tuple[str, FakeAdc, FaultSchedule]]:
-    """A fake converter on a bus server; gives its address."""
-    clock = SystemClock()
-    fake = FakeAdc(source, clock)  # type: ignore[arg-type]  # a sample source
-    buses = FakeBuses(clock)
-    buses.plug("x", fake)
-    server = BusServer(buses, "x", clock)
-    where = await server.listen(f"unix:{folder}/i2c" if kind == "unix" else "tcp://127.0.0.1:0")
-    schedule = FaultSchedule({"adc": fake})
-    try:
-        yield where, fake, schedule
-    finally:
-        schedule.close()
-        await server.close()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -169,110 +141,7 @@ def test_the_driver_survives_its_server(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_two_clients_take_turns(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, _, _schedule):
-            one, two = await open_bus(where), await open_bus(where)
-            done = await asyncio.gather(*(bus.transfer((read(0x4D, 400),)) for bus in (one, two, one, two)))
-            spans = sorted((d.t1 - d.t0) for d in done)
-            assert spans[-1] > 1.5 * spans[0]  # two of them had to wait for another one's
-            await one.close()
-            await two.close()
-
-    asyncio.run(main())
-
-
-def test_what_the_server_cannot_open_is_said_to_the_client(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, _, schedule):
-            for fault, kind, says in (
-                ("what = 'gone'", DeviceMissing, "no such bus"),
-                ("what = 'refuse'", DeviceRefused, "permission denied .*group i2c"),
-            ):
-                schedule.load(f"[[fault]]\n{fault}")
-                await asyncio.sleep(0.01)
-                with pytest.raises(kind, match=f"{where}: {says}"):
-                    await open_bus(where)
-                schedule.clear()
-
-    asyncio.run(main())
-
-
-@pytest.mark.parametrize(
-    "garbage",
-    [
-        b"GET / HTTP/1.1\r\n\r\n",
-        b"\x00\x00\x00\x01\x04",
-        b"\x00\x00\x00\x03\x03ab",
-        frames.transfer(1, (read(0x4D, 2),)).replace(b"\x4d\x01", b"\x4d\x02"),
-        b"\xff" * 100,
-    ],
-)
-def test_a_client_that_speaks_something_else_is_hung_up_on(garbage: bytes, tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, _, _schedule):
-            reader, writer = await asyncio.open_unix_connection(where.removeprefix("unix:"))
-            writer.write(garbage)
-            data = await asyncio.wait_for(reader.read(), 5.0)
-            kinds = [kind for kind, _ in frames.Splitter().feed(data)]
-            assert kinds[0] == frames.HELLO
-            assert len(kinds) <= 2
-            writer.close()
-            bus = await open_bus(where)  # and nobody else suffers
-            assert len((await bus.transfer((read(0x4D, 2),))).reads[0]) == 2
-            await bus.close()
-
-    asyncio.run(main())
-
-
-def test_a_client_cannot_order_without_end(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, fake, _schedule):
-            _, writer = await asyncio.open_unix_connection(where.removeprefix("unix:"))
-            writer.write(frames.transfer(1, (read(0x4D, 8192),)) * 2000)
-            await asyncio.sleep(0.5)
-            assert fake.bus.transactions <= 5
-            writer.close()
-
-    asyncio.run(main())
-
-
 # the client against servers that misbehave
-
-
-class Server:
-    """Accepts once and does as it is told, in a thread."""
-
-    def __init__(self, path: Path, behave: Callable[[socket.socket], None]) -> None:
-        self._listener = socket.socket(socket.AF_UNIX)
-        self._listener.bind(str(path))
-        self._listener.listen()
-        self._behave = behave
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        link, _ = self._listener.accept()
-        with link:
-            self._behave(link)
-        self._listener.close()
-
-    def join(self) -> None:
-        self._thread.join(10.0)
-
-
-def greet(link: socket.socket, clock: str = "") -> None:
-    link.sendall(frames.hello(time.monotonic(), clock or clock_name(), "a"))
-
-
-def answer(link: socket.socket, shift: float = 0.0) -> None:
-    """Answer one order."""
-    splitter = frames.Splitter()
-    while not (orders := splitter.feed(link.recv(4096))):
-        pass
-    number, messages = frames.parse_transfer(orders[0][1])
-    now = time.monotonic() + shift
-    link.sendall(frames.done(frames.Done(number, 0, now, now, now, now, (bytes(messages[-1].length),))))
 
 
 @pytest.mark.parametrize(
@@ -414,28 +283,3 @@ def test_why_there_is_no_connection(tmp_path: Path) -> None:
     datagrams.bind(str(tmp_path / "d"))
     with datagrams, pytest.raises(DeviceRefused, match="not a stream socket"):
         open_remote(f"unix:{tmp_path}/d")
-
-
-def test_a_server_makes_way_for_itself_only(tmp_path: Path) -> None:
-    async def main() -> None:
-        (tmp_path / "file").touch()
-        buses = FakeBuses(SystemClock())
-        with pytest.raises(DeviceRefused, match="no socket"):
-            await BusServer(buses, "x", SystemClock()).listen(f"unix:{tmp_path}/file")
-        with pytest.raises(DeviceRefused, match="cannot listen"):
-            await BusServer(buses, "x", SystemClock()).listen(f"unix:{tmp_path}/no/folder")
-        with socket.socket(socket.AF_UNIX) as crashed:  # leaves its file behind
-            crashed.bind(str(tmp_path / "s"))
-        server = BusServer(buses, "x", SystemClock())
-        await server.listen(f"unix:{tmp_path}/s")
-        await server.close()
-        assert not (tmp_path / "s").exists()
-
-    asyncio.run(main())
-
-
-def test_the_command_names_what_is_wrong(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "hal.bus.i2c_server", "/dev/i2c-250", f"unix:{tmp_path}/s"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
-    assert done.returncode == 2
-    assert done.stderr.startswith("/dev/i2c-250: no such bus (")

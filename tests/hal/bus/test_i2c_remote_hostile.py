@@ -23,7 +23,7 @@ from hal.clock import SystemClock
 from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.fake.adc.converter import FakeBuses
 from hal.photodiode.driver import PhotodiodeAdc
-from tests.hal.bus.test_i2c_remote import Server, greet, served
+from tests.hal.bus.remote_bus import Server, greet, served
 
 Reads = tuple[bytes, ...]
 

@@ -343,7 +343,7 @@ def test_whoever_makes_up_names_and_messages_does_not_fill_the_viewer(
             assert any("more than" in line for line in roster.problems())
             assert len(tokens) == 600
             assert 1 < max(asking) <= show.MOST_QUERIES + 1
-        await until(lambda: not any(one.there for one in roster.members.values() if one.name != "agv"))
+        await until(lambda: not any(one.present for one in roster.members.values() if one.name != "agv"))
         await asyncio.sleep(0.3)
         roster.drop_absent(time.monotonic(), router=True)
         assert list(roster.members) == ["agv"]
@@ -372,7 +372,7 @@ def test_messages_that_wait_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> Non
                 assert 1 <= len(roster.members) <= 4
                 other.put(messages.key("late", "state"), bytes(20_000))
                 await until(lambda: "late" in roster.members)
-            assert listener.there
+            assert listener.present
 
     with router() as made:
         asyncio.run(body(made))

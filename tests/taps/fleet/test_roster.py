@@ -15,7 +15,7 @@ from taps.fleet.roster import GONE_S, MOST_INSTANCES, MOST_ROBOTS, Roster
 from tests.taps.fleet.test_messages import HEAD, cells, pose_at
 
 
-def there(made: Roster, robot: str, is_there: bool = True) -> str:
+def present(made: Roster, robot: str, is_there: bool = True) -> str:
     return made.token(messages.alive(robot, "1.z.h"), is_there)
 
 
@@ -32,10 +32,10 @@ def noise(side: int) -> tuple[bytes, bytes]:
 def test_who_has_been_gone_for_long_leaves() -> None:
     made = Roster()
     for robot in ("gone", "silent"):
-        there(made, robot)
+        present(made, robot)
         tell(made, robot, 0.0)
     made.drop_absent(1.0, router=True)
-    there(made, "gone", False)
+    present(made, "gone", False)
     made.drop_absent(GONE_S, router=True)
     assert list(made.members) == ["gone", "silent"]
     made.drop_absent(GONE_S + 1.5, router=True)
@@ -46,7 +46,7 @@ def test_who_has_been_gone_for_long_leaves() -> None:
 
 def test_without_a_router_nobody_is_known_to_have_gone() -> None:
     made = Roster()
-    there(made, "agv")
+    present(made, "agv")
     tell(made, "agv", 0.0)
     made.without_router()
     made.drop_absent(5.0 * GONE_S, router=False)
@@ -56,7 +56,7 @@ def test_without_a_router_nobody_is_known_to_have_gone() -> None:
 
 def test_names_that_are_made_up_do_not_drive_out_robots_that_are_there() -> None:
     made = Roster()
-    there(made, "agv")
+    present(made, "agv")
     tell(made, "agv", 0.0)
     for number in range(3 * MOST_ROBOTS):
         tell(made, f"forged{number}", 1.0 + number)
@@ -64,26 +64,26 @@ def test_names_that_are_made_up_do_not_drive_out_robots_that_are_there() -> None
     assert "agv" in made.members
     assert made.problems() == []  # who has been gone longest makes room
     for number in range(3 * MOST_ROBOTS):
-        there(made, f"present{number}")
+        present(made, f"present{number}")
     assert len(made.members) == MOST_ROBOTS
     assert made.members["agv"].localised
-    assert there(made, "late") == ""
+    assert present(made, "late") == ""
     assert any(f"more than {MOST_ROBOTS} robots" in line for line in made.problems())
     assert len(drawing.table(made.sorted(), 1e4)) == MOST_ROBOTS + 1
-    there(made, "present1", False)
-    assert there(made, "late") == "late"
+    present(made, "present1", False)
+    assert present(made, "late") == "late"
 
 
 def test_no_robot_has_such_a_name() -> None:
     made = Roster()
-    assert there(made, 33 * "x") == ""
+    assert present(made, 33 * "x") == ""
     tell(made, 33 * "x", 1.0)
     assert not made.members
 
 
 def test_who_leaves_was_not_there_before() -> None:
     made = Roster()
-    there(made, "agv", False)
+    present(made, "agv", False)
     assert not made.members
 
 
