@@ -1,1 +1,1 @@
-"""SE(2), small and sparse linear algebra, and the JIT decorator of all kernels."""
+"""SE(2) transforms, small and sparse linear algebra, and the JIT decorator of all kernels."""

@@ -1,4 +1,4 @@
-"""Array types that all packages share."""
+"""numpy array types that all packages share: float64, int64, bool."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Sparse symmetric systems of 3 x 3 blocks: L D L^T by columns, and what a solution needs.
+"""Sparse L D L^T factorisation and solution of symmetric systems of 3 x 3 blocks (pose graph).
 
-A block row is a vector of four (the last is padding): processors multiply four numbers at once.
+The kernels unroll the 3 x 3 products by hand. The column pattern comes from `elimination_ordering`.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
 
 Pattern = tuple[Ints, Ints, Ints, Ints]
-"""Column start and rows, row start and columns: see `elimination_ordering.columns`."""
+"""Sparsity pattern of the factor: column start and rows, row start and columns; see `elimination_ordering.columns`."""
 
 
 @kernel("b1(f8[:, ::1], f8[:, ::1])", inner=True)
 def invert_block(A: Array, out: Array) -> bool:
-    """Inverse of a symmetric 3 x 3; False if it is not positive definite."""
+    """Invert a symmetric 3 x 3 block into ``out``; False if it is not positive definite."""
     a, b, c, d, e, f = A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2]
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
     det = a * p + b * q + c * r
@@ -33,10 +33,13 @@ def invert_block(A: Array, out: Array) -> bool:
     "i8(Tuple((i8[::1], i8[::1], i8[::1], i8[::1])), Tuple((f8[:, :, ::1], f8[:, :, ::1])), f8[:, :, ::1])", inner=True
 )
 def factor(pattern: Pattern, matrix: tuple[Array, Array], inverse: Array) -> int:
-    """Left-looking L D L^T in place; the first column that is not positive definite, or -1.
+    """Left-looking L D L^T in place. Returns the first column that is not positive definite, or -1.
 
-    ``matrix``: diagonal (n, 3, 3) and below it (nnz, 3, 3) at the places of the pattern. Afterwards the blocks below
-    hold ``U = L D``, and ``inverse`` (n, 3, 3) the inverse of D.
+    Args:
+        pattern: sparsity pattern of the factor.
+        matrix: diagonal blocks (n, 3, 3) and the blocks below it (nnz, 3, 3), at the positions of the pattern.
+            Afterwards the blocks below the diagonal hold ``U = L D``.
+        inverse: (n, 3, 3) out: the inverse of D.
     """
     start, down, row_start, across = pattern
     diagonal, below = matrix
@@ -82,7 +85,14 @@ def factor(pattern: Pattern, matrix: tuple[Array, Array], inverse: Array) -> int
 
 @kernel("void(Tuple((i8[::1], i8[::1], i8[::1], i8[::1])), f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])", inner=True)
 def solve(pattern: Pattern, below: Array, inverse: Array, b: Array) -> None:
-    """Turn the right side ``b`` (n, 3), in the order of elimination, into the solution."""
+    """Solve the factored system in place: ``b`` (n, 3), in elimination order, becomes the solution.
+
+    Args:
+        pattern: sparsity pattern of the factor.
+        below: (nnz, 3, 3) ``U = L D`` of :func:`factor`.
+        inverse: (n, 3, 3) the inverse of D.
+        b: (n, 3) right-hand side, replaced by the solution.
+    """
     start, down = pattern[0], pattern[1]
     n = len(start) - 1
     for j in range(n):
