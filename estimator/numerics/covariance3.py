@@ -1,7 +1,8 @@
-"""Kernels of the pose's covariance: carried along a motion, tied to the survey, mended by a match.
+"""Kernels for the 3x3 covariance of a pose: prediction, lever arm, rotation, measurement update.
 
-In one kernel each, because a cycle does some dozens of such things to 3x3 matrices, and calling numpy for each product
-costs more than all the arithmetic.
+A cycle does some dozens of these operations. Each is one kernel, because calling numpy for each 3x3 product costs more
+than all the arithmetic. In `grow_tie` and `mend_tie`, ``P`` is the covariance of ``T_map_base``. ``X`` is its
+cross-covariance with the error of ``T_odom_base``; see `estimator.fusion.map_odom_filter`.
 """
 
 from __future__ import annotations
@@ -15,15 +16,17 @@ from estimator.numerics.symmetric3 import add_turned, invert3, largest_of, swing
 
 @kernel("void(f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1])")
 def carry_on(T: Array, delta: Array, variance: Array, P: Array, T_out: Array, P_out: Array) -> None:
-    """Move a pose by ``delta`` in its own frame, with noise of ``variance`` (x, y, yaw) in the axes half way.
+    """Predict a pose and its covariance over the motion ``delta``, given in the frame of the pose (m, m, rad).
+
+    The noise acts in the axes of the pose half way through the turn.
 
     Args:
-        T: pose before.
-        delta: the motion.
-        variance: (3,) of it.
-        P: 3x3, of the pose, in the axes of its parent frame.
-        T_out: pose after, out.
-        P_out: its covariance, out.
+        T: (3,) pose before.
+        delta: (3,) motion.
+        variance: (3,) variance of the motion (x, y, yaw).
+        P: 3x3 covariance of the pose, in the axes of its parent frame.
+        T_out: (3,) out: pose after.
+        P_out: 3x3 out: covariance after.
     """
     c, s = np.cos(T[2]), np.sin(T[2])
     x, y = c * delta[0] - s * delta[1], s * delta[0] + c * delta[1]
@@ -39,15 +42,15 @@ def carry_on(T: Array, delta: Array, variance: Array, P: Array, T_out: Array, P_
 def feel_axes(
     velocity: Array, spread: Array, made: Array, variance: Array, unknown: Array, span: tuple[float, float]
 ) -> None:
-    """A scalar Kalman filter for each component of the velocity, in place; see `estimator.fusion.motion_model.feel`.
+    """Scalar Kalman update of each velocity component, in place; see `estimator.fusion.motion_model.feel`.
 
     Args:
-        velocity: (3,), changed.
-        spread: (3,) its variances, changed.
+        velocity: (3,) velocity (m/s, m/s, rad/s), updated.
+        spread: (3,) its variances, updated.
         made: (3,) twist over the interval.
-        variance: (3,) of it.
+        variance: (3,) variance of the twist.
         unknown: (3,) variance of the acceleration.
-        span: length of the interval; how long ago the velocity was last felt.
+        span: length of the interval; time since the last velocity update, both in s.
     """
     dt, late = span
     for axis in range(3):
@@ -59,15 +62,17 @@ def feel_axes(
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, :, ::1])")
 def grow_tie(P: Array, X: Array, before: Array, after: Array, made: Array, out: Array) -> None:
-    """The tie's covariances after a motion: swung along, with the noise that the motion has added to the pose's own.
+    """Predict the covariances ``P`` and ``X`` of the map-odom filter over a motion of the base.
+
+    Both rotate about the lever arm of the motion, and both receive the process noise of the odom pose.
 
     Args:
-        P: of the tie, see `estimator.fusion.map_odom_filter`.
-        X: likewise.
-        before: 3x3 of the pose.
-        after: the same after the motion.
-        made: (5,) x and y of the motion in the parent's axes, and what drift adds to the diagonal of ``P``.
-        out: (2, 3, 3) the new P and X.
+        P: 3x3, see `estimator.fusion.map_odom_filter`.
+        X: 3x3, likewise.
+        before: 3x3 covariance of the odom pose before the motion.
+        after: 3x3 covariance of the odom pose after the motion.
+        made: (5,) x and y of the motion in the parent's axes; drift noise for the diagonal of ``P``.
+        out: (2, 3, 3) out: the new P and X.
     """
     x, y = made[0], made[1]
     carried = before.copy()
@@ -85,7 +90,7 @@ def grow_tie(P: Array, X: Array, before: Array, after: Array, made: Array, out: 
 
 @kernel("void(f8[:, ::1], f8, f8[:, ::1])")
 def turn(P: Array, yaw: float, out: Array) -> None:
-    """``R P R'``: a covariance (x, y, yaw) in axes that are turned by ``-yaw`` against its own."""
+    """``R P R'``: rotate a covariance (x, y, yaw) by ``yaw``, into axes that are turned by ``-yaw`` from its own."""
     c, s = np.cos(yaw), np.sin(yaw)
     for j in range(3):
         out[0, j] = c * P[0, j] - s * P[1, j]
@@ -98,15 +103,17 @@ def turn(P: Array, yaw: float, out: Array) -> None:
 
 @kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1])")
 def hang(T_anchor: Array, T: Array, P_anchor: Array, P: Array, yaw: float, out: Array) -> None:
-    """Covariance of a pose that hangs on an anchor, turned by ``yaw``: the anchor's own, swung out, and the rest.
+    """Covariance of a pose that is relative to an uncertain anchor, rotated by ``yaw``.
+
+    The anchor's covariance acts through the lever arm from the anchor to the pose. The relative covariance is added.
 
     Args:
-        T_anchor: place of the anchor.
-        T: of the pose, in the same frame.
-        P_anchor: of the anchor.
-        P: of the pose relative to it.
-        yaw: by which the axes of the outcome are turned back against that frame's.
-        out: 3x3.
+        T_anchor: (3,) pose of the anchor.
+        T: (3,) the pose, in the same frame.
+        P_anchor: 3x3 covariance of the anchor.
+        P: 3x3 covariance of the pose relative to the anchor.
+        yaw: rotation of the result; its axes are turned by ``-yaw`` from that frame's, rad.
+        out: 3x3 out.
     """
     here = P_anchor.copy()
     swing(T[0] - T_anchor[0], T[1] - T_anchor[1], here)
@@ -125,12 +132,17 @@ def times(A: Array, B: Array, out: Array) -> None:
 
 
 MOST = 0.999
-"""Share of the tie's error that may be the pose's too; more is rounding's, and might leave a negative variance."""
+"""Largest share of the covariance ``P`` that the odom error may explain. A larger share is a rounding error and might
+leave a negative variance.
+"""
 
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])", inner=True)
 def no_more(P: Array, X: Array, K: Array) -> None:
-    """Scale the share ``K = X W^-1`` so that ``K W K' = X K'``, what it explains of ``P``, leaves something of it."""
+    """Limit the gain ``K = X W^-1``, in place, so that the covariance it explains stays below ``P``.
+
+    The explained covariance is ``K W K' = X K'``.
+    """
     explained = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -146,18 +158,19 @@ def no_more(P: Array, X: Array, K: Array) -> None:
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1])")
 def mend_tie(P: Array, X: Array, more: Array, before: Array, after: Array, out: Array) -> None:
-    """The tie's covariances after a match that has brought the pose's own from ``before`` to ``after``.
+    """Update the covariances ``P`` and ``X`` of the map-odom filter after a scan match.
 
-    No match takes more from the tie's error than there is: scans that came late, with light in between, may have left
-    an ``X`` that says so, and a negative variance would end the daemon where its root is taken.
+    The match reduced the covariance of the odom pose from ``before`` to ``after``. The gain is limited (`no_more`), so
+    that no match removes more covariance than there is. Late scans with light updates in between may have left too
+    large an ``X``. A negative variance would end the daemon where its square root is taken.
 
     Args:
-        P: of the tie.
-        X: likewise.
-        more: what these and ``before`` are raised by first.
-        before: 3x3 of the pose.
-        after: the same after the match.
-        out: (3, 3, 3) the new P and X, and the share of the match's correction that the tie's error takes.
+        P: 3x3 covariance.
+        X: 3x3 cross-covariance with the odom pose.
+        more: 3x3 inflation that is first added to both and to ``before``.
+        before: 3x3 covariance of the odom pose before the match.
+        after: 3x3 covariance of the odom pose after the match.
+        out: (3, 3, 3) out: the new P and X, and the gain from the match's correction to the error of ``P``.
     """
     wide, gained, part = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
@@ -183,7 +196,7 @@ def mend_tie(P: Array, X: Array, more: Array, before: Array, after: Array, out: 
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])")
 def informed(P: Array, H: Array, out: Array) -> None:
-    """``(P^-1 + H)^-1``, see `estimator.numerics.symmetric3.invert3`."""
+    """``(P^-1 + H)^-1``: covariance after an update with information ``H``; see `symmetric3.invert3`."""
     L = invert3(P)
     for i in range(3):
         for j in range(3):

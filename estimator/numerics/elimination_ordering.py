@@ -1,9 +1,9 @@
-"""In which order to eliminate the poses of a graph, and what each elimination fills in.
+"""Minimum-degree elimination ordering and symbolic factorisation of a pose graph.
 
 Approximate minimum degree on the quotient graph (Amestoy, Davis, Duff: An Approximate Minimum Degree Ordering
-Algorithm, SIAM J. Matrix Anal. Appl. 17(4), 1996) over poses, not over scalars: a pose's three unknowns always go
-together, which makes the graph nine times smaller and its order better. The element that an elimination leaves behind
-is the pattern of its column in the factor, so that ordering and symbolic factorisation are one pass.
+Algorithm, SIAM J. Matrix Anal. Appl. 17(4), 1996). The nodes are poses, not scalars. The three unknowns of a pose
+always belong together, which makes the graph nine times smaller and its order better. The element that an elimination
+leaves is the pattern of its column in the factor. Ordering and symbolic factorisation are therefore one pass.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ NONE = -1
 
 @kernel("Tuple((i8[::1], i8[::1]))(i8, i8[:, ::1])", aside=True)
 def adjacency(n: int, edges: Ints) -> tuple[Ints, Ints]:
-    """Neighbours of each of ``n`` poses, both ways, without repetition: start (n + 1,) and list."""
+    """Adjacency lists of ``n`` poses from edges (m, 2), symmetric and without duplicates.
+
+    Self edges and negative indices are ignored. Returns the start of each list (n + 1,) and the neighbours.
+    """
     start = np.zeros(n + 1, np.int64)
     for k in range(len(edges)):
         i, j = edges[k, 0], edges[k, 1]
@@ -52,7 +55,7 @@ def adjacency(n: int, edges: Ints) -> tuple[Ints, Ints]:
 
 @kernel("void(i8, i8, i8[:, ::1], i8[::1])", inner=True)
 def bucket_in(i: int, degree: int, links: Ints, head: Ints) -> None:
-    """Put pose ``i`` at the head of the list of those of this degree; ``links``: (next, previous) of each."""
+    """Insert pose ``i`` at the head of the list of its degree; ``links``: (next, previous) of each pose."""
     links[i, 0] = head[degree]
     links[i, 1] = NONE
     if head[degree] != NONE:
@@ -62,7 +65,7 @@ def bucket_in(i: int, degree: int, links: Ints, head: Ints) -> None:
 
 @kernel("void(i8, i8, i8[:, ::1], i8[::1])", inner=True)
 def bucket_out(i: int, degree: int, links: Ints, head: Ints) -> None:
-    """Take pose ``i`` out of the list of its degree."""
+    """Remove pose ``i`` from the list of its degree."""
     after, before = links[i, 0], links[i, 1]
     if before == NONE:
         head[degree] = after
@@ -73,10 +76,10 @@ def bucket_out(i: int, degree: int, links: Ints, head: Ints) -> None:
 
 
 Quotient = tuple[Ints, Ints, Ints, Ints]
-"""Of the quotient graph: slot of each pose in the list, the list, how many elements a slot begins with, its length."""
+"""Quotient graph: slot start of each pose, adjacency list, number of elements at the start of a slot, slot length."""
 
 Passed = tuple[Ints, Ints, Ints]
-"""What has been eliminated: step of each pose (NONE: not yet), whether its element was absorbed, element bounds."""
+"""Eliminated poses: step of each pose (NONE: not yet), whether its element was absorbed, bounds of the elements."""
 
 QUOTIENT = "Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))"
 PASSED = "Tuple((i8[::1], i8[::1], i8[::1]))"
@@ -84,7 +87,7 @@ PASSED = "Tuple((i8[::1], i8[::1], i8[::1]))"
 
 @kernel(f"i8(i8, {QUOTIENT}, {PASSED})", inner=True)
 def reach_of(p: int, graph: Quotient, passed: Passed) -> int:
-    """How many places eliminating ``p`` can fill at most."""
+    """Upper limit of the number of entries that eliminating ``p`` fills in."""
     first, near, elements, length = graph
     place, _, start = passed
     reach = length[p] - elements[p]
@@ -95,7 +98,7 @@ def reach_of(p: int, graph: Quotient, passed: Passed) -> int:
 
 @kernel(f"i8(i8, i8, {QUOTIENT}, {PASSED}, i8[::1], i8[::1])", inner=True)
 def gather(k: int, p: int, graph: Quotient, passed: Passed, mark: Ints, fill: Ints) -> int:
-    """Write the new element of pivot ``p``, neighbours and absorbed elements together; where it ends."""
+    """Write the new element of pivot ``p``: its neighbours and the elements it absorbs. Returns its end in ``fill``."""
     first, near, elements, length = graph
     place, gone, start = passed
     mark[p] = k
@@ -122,7 +125,7 @@ def gather(k: int, p: int, graph: Quotient, passed: Passed, mark: Ints, fill: In
 
 @kernel(f"void(i8, {QUOTIENT}, {PASSED}, i8[::1], i8[::1], i8)", inner=True)
 def weigh(k: int, graph: Quotient, passed: Passed, fill: Ints, weight: Ints, tag: int) -> None:
-    """How much of every element near the new one lies outside it: ``weight - tag``."""
+    """Size of the part of each adjacent element outside the new element, stored as ``weight - tag``."""
     first, near, elements, _ = graph
     place, gone, start = passed
     for m in range(start[k], start[k + 1]):
@@ -137,7 +140,10 @@ def weigh(k: int, graph: Quotient, passed: Passed, fill: Ints, weight: Ints, tag
 
 @kernel(f"i8(i8, i8, i8, {QUOTIENT}, {PASSED}, Tuple((i8[::1], i8[::1], i8)))", inner=True)
 def renew(k: int, p: int, i: int, graph: Quotient, passed: Passed, marks: tuple[Ints, Ints, int]) -> int:
-    """Replace in the slot of ``i`` what the new element covers; a bound of its degree besides the new element."""
+    """Update the slot of ``i`` after the elimination of ``p``: remove what the new element covers.
+
+    Returns a bound of the degree of ``i`` without the new element.
+    """
     first, near, elements, length = graph
     place, gone, _ = passed
     mark, weight, tag = marks
@@ -154,7 +160,7 @@ def renew(k: int, p: int, i: int, graph: Quotient, passed: Passed, marks: tuple[
         out += 1
         bound += weight[e] - tag
     if out == rest and rest < last:
-        # No element has made room for the new one, so a neighbour does that the new one covers: there is one, because
+        # No absorbed element freed an entry. A neighbour that the new element covers frees it. There is one, because
         # otherwise i would not be in it.
         for at in range(rest, last):
             if near[at] == p or mark[near[at]] == k:
@@ -176,10 +182,10 @@ def renew(k: int, p: int, i: int, graph: Quotient, passed: Passed, marks: tuple[
 
 @kernel("Tuple((i8[::1], i8[::1], i8[::1]))(i8[::1], i8[::1])", aside=True)
 def minimum_degree(first: Ints, near: Ints) -> tuple[Ints, Ints, Ints]:
-    """Order of elimination (n,), and per pose eliminated: start (n + 1,) of the poses it fills in, by old number.
+    """Elimination order (n,), and the fill of each eliminated pose: start (n + 1,) and poses by old number.
 
-    ``near`` is used up: a pose's slot holds its elements first, then the neighbours that are still there; both
-    together never outgrow it.
+    ``near`` is overwritten. A pose's slot holds its elements first, then the neighbours not yet eliminated. Both
+    together never exceed the slot.
     """
     n = len(first) - 1
     order, start = np.empty(n, np.int64), np.zeros(n + 1, np.int64)
@@ -218,7 +224,7 @@ def minimum_degree(first: Ints, near: Ints) -> tuple[Ints, Ints, Ints]:
 
 @kernel("Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))(i8[::1], i8[::1], i8[::1])", aside=True)
 def columns(order: Ints, start: Ints, fill: Ints) -> tuple[Ints, Ints, Ints, Ints]:
-    """The factor's pattern in the new order, sorted: column start and rows; row start and columns."""
+    """Pattern of the factor in the new order, sorted: column start and rows; row start and columns."""
     n, total = len(order), len(fill)
     place = np.empty(n, np.int64)
     for k in range(n):

@@ -1,14 +1,14 @@
-"""The one way to make a numba function here.
+"""The numba JIT decorator `kernel` of all hot functions.
 
-Every hot function is written as a plain Python function and decorated with :func:`kernel`:
+Every hot function is a plain Python function with this decorator:
 
-* an explicit signature: it compiles when imported, never inside a cycle, and a wrong dtype is a ``TypeError``; those
-  that only kernels call (``inner``) are in their callers' machine code, and a start does without their own;
-* with the interpreter held, but where ``aside`` says otherwise: letting it go and taking it back costs as much as the
-  arithmetic of a small kernel, and while a background job runs Python, whoever has let go waits for it every time;
-* NaN-safe fast math: ``nnan`` and ``ninf`` are left out, because they fold ``isnan`` to False;
+* explicit signature: it compiles at import, never inside a cycle, and a wrong dtype is a ``TypeError``.
+  Kernels that only kernels call (``inner``) are part of their callers' machine code and are not loaded at a start.
+* GIL held, unless ``aside``: releasing and taking it costs as much as the arithmetic of a small kernel.
+  While a background job runs Python, each thread that released the GIL waits for it every time.
+* NaN-safe fast math: without ``nnan`` and ``ninf``, because they fold ``isnan`` to False;
 * ``error_model="numpy"``: division by zero yields inf, as in the slow twin;
-* cached on disk, in the directory of `jit_cache`, and taken from there by `jit_cache_load`.
+* cached on disk, in the directory of `jit_cache`, and loaded by `jit_cache_load`.
 """
 
 from __future__ import annotations
@@ -43,12 +43,14 @@ def kernel(
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Compile a function for one explicit signature (numba's string notation, e.g. ``"f8(f8[::1], i8)"``).
 
-    ``inline`` writes its body into the kernels that call it: handing over three arrays costs as much as ten points.
-    ``inner`` says that kernels alone call it, as they alone call those with ``inline``.
-    ``aside`` lets other threads run Python meanwhile: for what takes longer than some 50 us in background jobs.
-
     The plain Python function stays reachable as ``.py_func`` for the slow-twin tests and for coverage. With
     ``NUMBA_DISABLE_JIT=1`` nothing is compiled and every kernel is its own ``.py_func``.
+
+    Args:
+        signature: types of the result and the arguments.
+        inline: insert the body into the calling kernels: passing three arrays costs as much as ten points.
+        aside: release the GIL: for background jobs that take longer than some 50 us.
+        inner: only kernels call it, as with ``inline``.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -72,7 +74,7 @@ def kernel(
 
 
 def _compile(compiled: Any, signature: str) -> None:
-    """For this signature, and for no other ever: what `numba.njit` does that is given one."""
+    """Load or compile this signature, and disable all others, as `numba.njit` with a signature does."""
     if not loaded(compiled, signature):
         _get_ready()
         compiled.compile(signature)
@@ -80,10 +82,10 @@ def _compile(compiled: Any, signature: str) -> None:
 
 
 def _get_ready() -> None:
-    """Import the module of numba's that asks whether scipy's BLAS is there; it is told that there is none.
+    """Import ``numba.np.arraymath`` without scipy's BLAS.
 
-    A large part of scipy would be loaded with it, 17 MB, and no kernel uses BLAS. None makes that one import fail,
-    which numba takes for an answer.
+    That module tests whether scipy's BLAS is present, which would load a large part of scipy, 17 MB. No kernel uses
+    BLAS. None in `sys.modules` makes that one import fail, which numba accepts as absence.
     """
     hide = _BLAS not in sys.modules
     if hide:
@@ -96,7 +98,7 @@ def _get_ready() -> None:
 
 
 def _compile_on_use(compiled: Any, signature: str) -> None:
-    """As late as a kernel that calls it is compiled, or a test calls it."""
+    """Postpone compilation until a calling kernel is compiled or a test calls the function."""
     of_callers, of_calls = compiled.get_call_template, compiled._compile_for_args
 
     def now() -> None:
@@ -109,13 +111,16 @@ def _compile_on_use(compiled: Any, signature: str) -> None:
 
     def compile_for_args(*args: Any, **kws: Any) -> Any:
         now()
-        return compiled  # whoever asks calls what it gets
+        return compiled  # the caller calls the returned dispatcher
 
     compiled.get_call_template, compiled._compile_for_args = get_call_template, compile_for_args
 
 
 def _announce_no_calls() -> None:
-    """To numba's listeners, of which there are none: a start makes 20 000 calls of LLVM, and spends a sixth on that."""
+    """Clear numba's list of LLVM call listeners, which has no use here.
+
+    A start makes 20 000 calls of LLVM and spends a sixth of its time on the listeners.
+    """
     with contextlib.suppress(AttributeError):  # private upstream
         llvmlite.binding.ffi.lib._lock._cblist.clear()
 

@@ -1,11 +1,11 @@
-"""The one place where compiled kernels are kept, found without loading the compiler: is there anything to compile?
+"""Directory of the on-disk cache of compiled kernels, found without loading the compiler.
 
-A directory named by a hash of *all* kernel sources, of the compiler's versions and of its settings. numba's own key
-does not cover callees in other files, so an edited callee would leave a stale caller behind, nor the settings that come
-from the environment: a run with ``NUMBA_BOUNDSCHECK=1`` (every index is checked, `IndexError`) or
-``NUMBA_CPU_NAME=generic`` (no instructions beyond the architecture's first) has a directory of its own.
+Its name is a hash of *all* kernel sources, of the compiler's versions and of its settings. numba's own key does not
+cover callees in other files, so an edited callee would leave a stale caller. Nor does it cover the settings from the
+environment. So each such setting has a directory of its own: ``NUMBA_BOUNDSCHECK=1`` (every index is checked,
+`IndexError`), or ``NUMBA_CPU_NAME=generic`` (baseline instructions of the architecture only).
 
-This is the only module of the room that touches the file system; it does so once, when first imported.
+This is the only module of the estimator that touches the file system; it does so once, when first imported.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Final
 
 KEPT: Final = 4
-"""Directories of other sources that are kept beside our own, the latest used ones."""
+"""Number of directories of other sources that are kept, the most recently used."""
 KEPT_S: Final = 7 * 86400.0
-"""And all that were used more recently than this: their programs may be running..."""
+"""All directories used within this time (s) are kept too, because their programs may be running..."""
 MOST: Final = 40
-"""...but no more than these in all, some 10 MB each. A running program has its kernels in memory and misses nothing."""
+"""...up to this total, some 10 MB each. A running program has its kernels in memory and loses nothing."""
 
 SHAPING: Final = (
     "BOUNDSCHECK",
@@ -36,11 +36,11 @@ SHAPING: Final = (
     "SLP_VECTORIZE",
     "DEBUGINFO_DEFAULT",
 )
-"""numba's settings (environment variables, without their prefix ``NUMBA_``) that shape the machine code."""
+"""numba settings (environment variables, without their prefix ``NUMBA_``) that affect the machine code."""
 
 
 def source_key() -> str:
-    """Hash of every source file of this room and of the versions and settings that turn it into machine code."""
+    """Hash of every source file of the estimator and of the versions and settings that affect its machine code."""
     digest = hashlib.sha256()
     room = Path(__file__).parents[1]
     for path in sorted(room.rglob("*.py")):
@@ -53,7 +53,7 @@ def source_key() -> str:
 
 
 def _writable(directory: Path) -> bool:
-    """Whether a file can be made there: numba ignores a cache directory it cannot create a file in, silently."""
+    """Whether a file can be created there. numba silently ignores a cache directory it cannot write to."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=directory):
@@ -75,6 +75,7 @@ def _cache_roots() -> list[Path]:
 
 
 def _last_used(directory: Path) -> float:
+    """Time of the last use of a directory (s, modification time)."""
     try:
         return directory.stat().st_mtime
     except OSError:  # another process has removed it just now
@@ -82,7 +83,7 @@ def _last_used(directory: Path) -> float:
 
 
 def _prune(root: Path, ours: Path) -> None:
-    """Remove what earlier versions left behind; whatever cannot be removed stays."""
+    """Remove cache directories of other sources; those that cannot be removed stay."""
     now = _last_used(ours)
     others = sorted((path for path in root.glob("kernels-*") if path != ours), key=_last_used, reverse=True)
     for rank, path in enumerate(others):
@@ -91,12 +92,17 @@ def _prune(root: Path, ours: Path) -> None:
 
 
 def _choose_cache() -> Path:
+    """First cache root that is writable, with the directory of these sources; removes old directories when it is new.
+
+    Raises:
+        RuntimeError: no root is writable.
+    """
     key = source_key()
     for root in _cache_roots():
         directory = root / f"kernels-{key}"
         is_new = not directory.exists()
         if _writable(directory):
-            os.utime(directory)  # when it was last used
+            os.utime(directory)  # marks the last use
             if is_new:
                 _prune(root, directory)
             return directory
@@ -104,4 +110,4 @@ def _choose_cache() -> Path:
 
 
 CACHE_DIR: Final = _choose_cache()
-"""Where compiled kernels of exactly these sources live."""
+"""Directory of the compiled kernels of exactly these sources."""

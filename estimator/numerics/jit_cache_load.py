@@ -1,13 +1,13 @@
-"""A kernel that has been compiled before is taken from the disk without what only compiling needs.
+"""Loads compiled kernels from the disk without numba's preparations for compiling.
 
-Before numba looks into its cache it gets ready to compile: it imports a hundred of its modules and fills its tables of
-what every operation may be applied to; and with the machine code of a kernel it reads its bitcode, for those that will
-be compiled with its body in them. A start where nothing is compiled needs neither: that is two thirds of what loading
-the kernels takes, and 30 MB. So the machine code alone is loaded, and bitcode is read by the first who asks for it.
-Last, numba compiles its counting of references, to be written into kernels: kept ones have it in them, and need no
-more than the names of what it calls. That is a third of what is left, and no part of LLVM that compiles is touched.
+Before numba searches its cache it prepares to compile: it imports a hundred of its modules and fills its type tables.
+With the machine code of a kernel it also reads the bitcode, for inlining into kernels yet to be compiled. A start that
+compiles nothing needs neither: that is two thirds of the loading time of the kernels, and 30 MB. So only the machine
+code is loaded; bitcode is parsed on first use.
+numba also compiles its reference counting, to be inlined into kernels. Cached kernels already contain it and need only
+the addresses of the functions it calls. That is a third of the rest, and LLVM's compiler is not used at all.
 
-Most of what is used here is private upstream. Where a version of numba has none of it, its own way is gone.
+Most of this relies on private parts of numba. With a version that lacks them, numba's own cache is used.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from numba.core.compiler_lock import global_compiler_lock
 _upstream: Any = codegen  # untyped
 _runtime: Any = sys.modules.get("numba.core.runtime._nrt_python")
 _WRAPPER: Final = "_ZN7cpython"
-"""How the names of functions begin that Python calls (`numba.core.itanium_mangler`)."""
+"""Prefix of the names of functions that Python calls (`numba.core.itanium_mangler`)."""
 
 
 class _Kept(_upstream.JITCodeLibrary):  # type: ignore[misc]  # untyped upstream
-    """Machine code, with the bitcode beside it unread until it is to be written into another kernel's."""
+    """Machine code with its bitcode unparsed until another kernel inlines it."""
 
     _bitcode = b""
     _read: Any = None
@@ -56,7 +56,7 @@ class _Kept(_upstream.JITCodeLibrary):  # type: ignore[misc]  # untyped upstream
         self._read = module
 
     def get_pointer_to_function(self, name: str) -> int:
-        if self._bitcode and name.startswith(_WRAPPER):  # it is there; other names are in what has not been read
+        if self._bitcode and name.startswith(_WRAPPER):  # is present; other names are in the unparsed bitcode
             self._codegen._engine._defined_symbols.add(name)
         return int(super().get_pointer_to_function(name))
 
@@ -73,18 +73,19 @@ if _known:
 
 @cache
 def _name_helpers() -> None:
-    """Tell LLVM the functions in C that manage memory, by the names that machine code calls them by.
+    """Register with LLVM the C functions for memory management, under the names that machine code uses.
 
-    As numba's `_Runtime.initialize` does, which does it again, and the rest, before anything is compiled.
+    numba's `_Runtime.initialize` does the same, and the rest, before anything is compiled.
     """
     for name, address in _runtime.c_helpers.items():
         llvmlite.binding.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
 
 def loaded(compiled: Any, signature: str) -> bool:
-    """Give a `numba.njit` function the machine code that was kept for this signature; False: none was, or no such way.
+    """Load the cached machine code of this signature into a `numba.njit` function.
 
-    What `Dispatcher.compile` does where its cache has it, but for ``refresh()`` of the tables.
+    As `Dispatcher.compile` does on a cache hit, without ``refresh()`` of the type tables. Returns False if nothing is
+    cached or if this version of numba does not allow it.
     """
     if not _known or not hasattr(compiled._cache, "_load_overload"):
         return False

@@ -1,4 +1,4 @@
-"""The poses of the latest stretch of time, interpolated at constant twist."""
+"""Buffer of recent poses, interpolated at constant twist."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 
 Stamped = tuple[float, Array]
-"""An instant (s) and the pose (x, y, yaw) then."""
+"""An instant (s) and the pose (x, y, yaw) at it."""
 
 
 @dataclass(slots=True, eq=False)
 class PoseHistory:
-    """Poses in order of arrival; their instants never fall.
+    """Poses in order of arrival, with non-decreasing instants.
 
     Attributes:
-        span_s: how far back poses are kept, s. first: of several poses of one instant the first ends the stretch before
-            that instant, as where a prediction is replaced by what odometry says of the same stretch; else the latest.
+        span_s: length of the history, s.
+        first: which of several poses of one instant ends the interval before that instant. True: the first, as where
+            odometry replaces a prediction over the same interval. False: the latest.
         poses: oldest first.
     """
 
@@ -27,13 +28,16 @@ class PoseHistory:
     poses: deque[Stamped] = field(default_factory=deque)
 
     def add(self, t_mono: float, T: Array) -> None:
-        """Append a pose and drop those that are too old."""
+        """Append a pose and drop those older than the span."""
         self.poses.append((t_mono, T))
         while t_mono - self.poses[0][0] > self.span_s:
             self.poses.popleft()
 
     def at(self, t_mono: float, after: Stamped) -> Array:
-        """The pose at an instant before ``after``, a known later one; the oldest pose where it was earlier still."""
+        """Pose at an instant, interpolated up to ``after``, a known later pose.
+
+        Before the oldest pose it returns the oldest.
+        """
         for t, T in reversed(self.poses):
             if t <= t_mono and (self.first or t_mono < after[0]):
                 span = after[0] - t

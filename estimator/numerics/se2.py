@@ -1,4 +1,4 @@
-"""Planar rigid transforms as float64 arrays ``(x, y, yaw)``; ``T_a_b`` maps b coordinates into a (metres, radians)."""
+"""SE(2): planar rigid transforms as float64 arrays ``(x, y, yaw)``; ``T_a_b`` maps b coordinates into a (m, m, rad)."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from estimator.numerics.arrays import Array
 
 
 def identity() -> Array:
-    """The transform that moves nothing."""
+    """The identity transform."""
     return np.zeros(3)
 
 
 def wrap(angle: float) -> float:
-    """The same angle in [-pi, pi)."""
+    """The angle wrapped into [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def compose(T_a_b: Array, T_b_c: Array) -> Array:
-    """``T_a_c``; yaw stays wrapped."""
+    """``T_a_c = T_a_b T_b_c``, with yaw wrapped."""
     x, y, yaw = T_a_b.tolist()
     u, v, w = T_b_c.tolist()
     c, s = math.cos(yaw), math.sin(yaw)
@@ -28,7 +28,7 @@ def compose(T_a_b: Array, T_b_c: Array) -> Array:
 
 
 def compose_all(T_a_b: Array, T_b_c: Array) -> Array:
-    """:func:`compose` with each row of ``T_b_c`` (n, 3)."""
+    """:func:`compose` with each row of ``T_b_c`` (n, 3); returns (n, 3)."""
     c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     u, v, yaw = T_b_c.T
     turned = (T_a_b[2] + yaw + math.pi) % (2.0 * math.pi) - math.pi
@@ -43,7 +43,7 @@ def inverse(T_a_b: Array) -> Array:
 
 
 def between(T_a_b: Array, T_a_c: Array) -> Array:
-    """``T_b_c``: where c is, seen from b."""
+    """``T_b_c``: pose of c relative to b."""
     x, y, yaw = T_a_b.tolist()
     u, v, w = T_a_c.tolist()
     c, s = math.cos(yaw), math.sin(yaw)
@@ -52,7 +52,7 @@ def between(T_a_b: Array, T_a_c: Array) -> Array:
 
 
 def log(T: Array) -> Array:
-    """The constant body twist that makes this motion in unit time."""
+    """Logarithm map: constant body twist that produces this motion in unit time."""
     x, y, yaw = T.tolist()
     half = 0.5 * yaw
     k = 1.0 - half * half / 3.0 if abs(yaw) < 1e-4 else half / math.tan(half)
@@ -60,7 +60,7 @@ def log(T: Array) -> Array:
 
 
 def exp(twist: Array) -> Array:
-    """The motion after unit time at this constant body twist; the inverse of :func:`log`."""
+    """Exponential map: motion after unit time at this constant body twist; the inverse of :func:`log`."""
     u, v, w = twist.tolist()
     if abs(w) < 1e-4:
         s, c = 1.0 - w * w / 6.0, 0.5 * w
@@ -70,37 +70,40 @@ def exp(twist: Array) -> Array:
 
 
 def apply(T_a_b: Array, points_b: Array) -> Array:
-    """Points of shape (n, 2) mapped from b into a."""
+    """Points (n, 2) mapped from b into a."""
     x, y, yaw = T_a_b.tolist()
     c, s = math.cos(yaw), math.sin(yaw)
     return np.asarray(points_b @ np.array(((c, s), (-s, c))) + np.array((x, y)))
 
 
 def rotation(yaw: float) -> Array:
-    """3x3 matrix that turns (x, y) by ``yaw`` and keeps the yaw component."""
+    """3x3 matrix that rotates (x, y) by ``yaw`` and keeps the yaw component."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
 
 
 def carry(T_a_b: Array, T_b_c: Array, P_b: Array) -> Array:
-    """Covariance of ``T_a_c`` from that of ``T_a_b`` (world-aligned, 3x3): a heading error swings the lever arm."""
+    """Covariance of ``T_a_c`` from ``P_b``, that of ``T_a_b`` (3x3, axes of a).
+
+    A heading error of b moves c along the lever arm.
+    """
     x, y, _ = (compose(T_a_b, T_b_c) - T_a_b).tolist()
     F = np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
     return np.asarray(F @ P_b @ F.T)
 
 
 def adjoint(T: Array) -> Array:
-    """3x3: what a small motion of the frame behind ``T`` is in the frame before it: ``T Exp(d) = Exp(Ad d) T``."""
+    """Adjoint matrix (3x3) of ``T``: ``T Exp(d) = Exp(Ad d) T``, a small motion expressed in the frame before ``T``."""
     A = rotation(float(T[2]))
     A[0, 2], A[1, 2] = T[1], -T[0]
     return A
 
 
 def fraction(T: Array, share: float) -> Array:
-    """The part of a motion that is made in a share of its time, at constant twist."""
+    """Motion over a share (0 to 1) of the time of ``T``, at constant twist."""
     return exp(log(T) * share)
 
 
 def lever_matrix(lever: Array) -> Array:
-    """Jacobian (3, 3) of a pose error carried along a lever (x, y): a heading error moves the far end."""
+    """Jacobian (3, 3) of a pose error at the far end of a lever (x, y), m: a heading error moves that end."""
     return np.array(((1.0, 0.0, -lever[1]), (0.0, 1.0, lever[0]), (0.0, 0.0, 1.0)))

@@ -1,4 +1,4 @@
-"""Symmetric 3x3 systems, small enough to be solved inside the matching kernels."""
+"""Symmetric 3x3 linear algebra in kernels: solve, invert, eigenvalues, lever arm of a covariance."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 TINY = 1e-9
-"""What is added to a diagonal: less than any uncertainty that matters (0.03 mm), and keeps an inverse finite."""
+"""Added to a diagonal, so that the inverse stays finite. Its sigma (0.03 mm) is below any that matters."""
 
 
 @kernel("f8(f8[:, ::1], f8[::1], f8[::1])", inner=True)
@@ -67,9 +67,10 @@ def eigen3(A: Array, V: Array) -> None:
 
 @kernel("f8[:, ::1](f8[:, ::1])")
 def invert3(A: Array) -> Array:
-    """Inverse of a symmetric positive matrix; a little is added to its diagonal first, so that there always is one.
+    """Inverse of a symmetric positive matrix, regularised by `TINY` on the diagonal, so that it always exists.
 
-    Turns covariance into information and back. Scaled to a unit diagonal, because metres and radians may differ widely.
+    Converts covariance to information and back. The matrix is scaled to a unit diagonal, because metres and radians may
+    differ widely.
     """
     B = np.empty((3, 3))
     scale = np.empty(3)
@@ -95,7 +96,7 @@ def invert3(A: Array) -> Array:
 
 @kernel("f8[:, ::1](f8[:, ::1])")
 def positive_part(A: Array) -> Array:
-    """The nearest symmetric matrix without negative eigenvalues."""
+    """Nearest symmetric matrix without negative eigenvalues."""
     B, V, out = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -110,7 +111,10 @@ def positive_part(A: Array) -> Array:
 
 @kernel("f8(f8[:, ::1], f8[:, ::1])")
 def largest_of(G: Array, P: Array) -> float:
-    """Largest eigenvalue of ``G P``, both symmetric, P not negative: it is that of ``L' G L`` with ``P = L L'``."""
+    """Largest eigenvalue of ``G P``, both symmetric and P positive semidefinite.
+
+    It equals that of ``L' G L`` with ``P = L L'`` (Cholesky).
+    """
     L, B, V = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
     for j in range(3):
         for i in range(j, 3):
@@ -133,7 +137,7 @@ def largest_of(G: Array, P: Array) -> float:
 
 @kernel("f8(f8[:, ::1])")
 def det3(A: Array) -> float:
-    """Determinant."""
+    """Determinant of a 3x3 matrix."""
     minor_0 = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
     minor_1 = A[1, 0] * A[2, 2] - A[1, 2] * A[2, 0]
     minor_2 = A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]
@@ -143,9 +147,9 @@ def det3(A: Array) -> float:
 
 @kernel("void(f8, f8, f8[:, ::1])")
 def swing(x: float, y: float, P: Array) -> None:
-    """Covariance (x, y, yaw) of what a lever arm (x, y) in the same axes carries, in place: a heading error swings it.
+    """Propagate a covariance (x, y, yaw) along a lever arm (x, y), in place: a heading error moves the far end.
 
-    ``P`` may be a covariance between two such errors as well; both swing alike.
+    The lever arm is in the axes of ``P``. ``P`` may also be the cross-covariance of two such errors.
     """
     for j in range(3):
         P[0, j] -= y * P[2, j]
@@ -157,7 +161,7 @@ def swing(x: float, y: float, P: Array) -> None:
 
 @kernel("void(f8, f8[::1], f8[:, ::1])")
 def add_turned(yaw: float, variance: Array, P: Array) -> None:
-    """Add noise whose axes are turned by ``yaw`` to a covariance, in place; ``variance`` along these axes."""
+    """Add noise of ``variance`` (x, y, yaw) to a covariance, in place; its axes are turned by ``yaw``."""
     c, s = np.cos(yaw), np.sin(yaw)
     P[0, 0] += c * c * variance[0] + s * s * variance[1]
     P[1, 1] += s * s * variance[0] + c * c * variance[1]
@@ -167,5 +171,5 @@ def add_turned(yaw: float, variance: Array, P: Array) -> None:
 
 
 def symmetric(A: Array) -> Array:
-    """The symmetric part of a matrix, which rounding leaves of one that should be."""
+    """Symmetric part of a matrix; removes the asymmetry that rounding leaves."""
     return np.asarray(0.5 * (A + A.T))
