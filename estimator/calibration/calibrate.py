@@ -1,7 +1,8 @@
-"""Calibration from a drive: what each lamp really sends and how the receiver looks, with uncertainties.
+"""Calibration of lamps and receiver from a drive: fits the lamp survey to RSS received at known poses.
 
-In go poses of the robot and the strengths received there; out comes the survey with gains, Lambert orders, slopes, the
-diffuse share, the receiver's order, lean and lever arm. What the drive cannot tell keeps its value and is named.
+Input: poses of the robot and the RSS received there. Output: the survey with gain, Lambert order and tilt of each lamp
+and the diffuse floor. It also has the receiver's order, tilt and lever arm. All come with sigmas. A parameter that the
+drive does not determine keeps its value and is named.
 """
 
 from __future__ import annotations
@@ -20,25 +21,27 @@ from estimator.light_filter.survey import Survey
 from estimator.numerics.arrays import Array
 
 TOLD: Final = 0.7
-"""A parameter is told by the drive if its sigma fell below this part of its prior's."""
+"""A drive determines a parameter if it reduces the sigma below this share of the prior sigma."""
 PRIORS: Final = Priors()
 FEWEST_ROWS: Final = 30
+"""Observations in plain view without which nothing is calibrated."""
 FEWEST_OF_A_LAMP: Final = 6
+"""Observations without which a lamp is not calibrated."""
 
 _UNITS: Final = {"gain": "ln", "floor": "", "order": "", "slope": "m/m", "frame_yaw": "rad"}
 
 
 class TooLittle(ValueError):
-    """The drive does not hold enough to calibrate anything; the text says what is missing."""
+    """The drive holds too little to calibrate anything; the message names what is missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """One parameter.
+    """Estimate of one parameter, before and after the fit.
 
     Attributes:
-        lamp_id: of whose lamp, None for one common to all. name: as in the survey. unit: of all values.
-        before, after: value. sigma: one sigma afterwards; prior: one sigma before. told: whether the drive told it.
+        lamp_id: lamp of the parameter, None for a parameter common to all. name: as in the survey. unit: of all values.
+        before, after: value. sigma: one sigma after the fit. prior: one sigma before it.
     """
 
     lamp_id: int | None
@@ -51,20 +54,21 @@ class Estimate:
 
     @property
     def told(self) -> bool:
-        """Whether the drive says more about it than was known before."""
+        """Whether the drive determined this parameter, that is, reduced its sigma below `TOLD` times the prior."""
         return self.sigma < TOLD * self.prior
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibrated:
-    """A calibration.
+    """Result of a calibration.
 
     Attributes:
-        survey: with the new values. estimates: every parameter that was free.
-        rows: what was used (thinned). used: (n,) which of them were not left out.
+        survey: with the new values. estimates: every free parameter.
+        rows: observations after thinning. used: (n,) observations that were not rejected.
         before, after: (n,) residuals ln(received / expected). T_survey_drive: (x, y, yaw) of the drive's frame.
-        scale: one sigma of ln strength that the model leaves unexplained. untouched: lamp IDs with too few strengths.
+        scale: one sigma of ln RSS that the model does not explain. untouched: IDs of lamps with too few observations.
         covariance: (p, p) of all parameters, in the order of `estimator.calibration.parameters`.
+        converged: whether the last steps of the solver were small.
     """
 
     survey: Survey
@@ -80,32 +84,37 @@ class Calibrated:
     converged: bool
 
     def rms(self) -> tuple[float, float]:
-        """RMS of ln strength over the rows used, before and after."""
+        """RMS of the residuals (ln RSS) over the rows used, before and after."""
         first, last = (float(np.sqrt(np.mean(r[self.used] ** 2))) for r in (self.before, self.after))
         return first, last
 
 
 def calibrate_lamps(survey: Survey, rows: Rows, priors: Priors = PRIORS, start: Array | None = None) -> Calibrated:
-    """Fit a survey to a drive.
+    """Fit the survey to one drive.
 
     Args:
-        survey: as known before; ``rows.lamp`` counts its lamps.
-        rows: strengths with poses; thinned here.
-        priors: how well the survey was known.
-        start: (x, y, yaw) of the drive's frame in the survey's, where priors let that be found.
+        survey: prior values; ``rows.lamp`` indexes its lamps.
+        rows: RSS with poses; thinned here.
+        priors: prior sigmas of the parameters.
+        start: (x, y, yaw) initial pose of the drive's frame in the survey's, where the priors leave it free.
 
     Raises:
-        TooLittle: fewer than 30 strengths in plain view, or no lamp with six.
+        TooLittle: fewer than 30 observations in plain view, or no lamp with six.
     """
     return _fitted(survey, thinned(rows), priors, start)
 
 
 def calibrate_from(survey: Survey, parts: Sequence[Rows], priors: Priors) -> Calibrated:
-    """The same from rows that are thinned already, in parts; raises `TooLittle`."""
+    """Fit the survey to rows that are already thinned, in several parts.
+
+    Raises:
+        TooLittle: fewer than 30 observations in plain view, or no lamp with six.
+    """
     return _fitted(survey, joined(parts), priors, None)
 
 
 def _fitted(survey: Survey, rows: Rows, priors: Priors, start: Array | None) -> Calibrated:
+    """Check that the rows suffice, and solve."""
     task = problem(survey, priors)
     if start is not None:
         task.before[Common.FRAME_X : Common.FRAME_YAW + 1] = start
@@ -120,6 +129,7 @@ def _fitted(survey: Survey, rows: Rows, priors: Priors, start: Array | None) -> 
 
 
 def _calibrated(task: Problem, rows: Rows, before: Array, found: Solution) -> Calibrated:
+    """Assemble the result from the solution; ``before``: (n,) residuals at the prior values."""
     counts = np.bincount(rows.lamp[found.used], minlength=len(task.lamps))
     untouched = tuple(lamp.lamp_id for lamp, n in zip(task.survey.lamps, counts, strict=True) if n < FEWEST_OF_A_LAMP)
     return Calibrated(
@@ -138,7 +148,7 @@ def _calibrated(task: Problem, rows: Rows, before: Array, found: Solution) -> Ca
 
 
 def sigma_power(task: Problem, found: Solution) -> Array:
-    """(K,) one sigma of ln power of each lamp, the common part included; the prior's for a lamp taken as given."""
+    """(K,) one sigma of ln power of each lamp, including the common gain; the prior sigma for a fixed lamp."""
     P, common = found.covariance, int(Common.GAIN)
     own = np.array([task.own(k).start + int(Own.GAIN) for k in range(len(task.lamps))], dtype=np.int64)
     variance = P[own, own] + P[common, common] + 2.0 * P[own, common]
@@ -148,7 +158,7 @@ def sigma_power(task: Problem, found: Solution) -> Array:
 
 
 def estimates(task: Problem, found: Solution) -> tuple[Estimate, ...]:
-    """Every free parameter, common ones first."""
+    """Estimates of every free parameter, common ones first."""
     names: list[tuple[int | None, str]] = [(None, c.name.lower()) for c in Common]
     names += [(lamp.lamp_id, o.name.lower()) for lamp in task.survey.lamps for o in Own]
     assert len(names) == COMMONS + OWNS * len(task.lamps)
@@ -160,6 +170,7 @@ def estimates(task: Problem, found: Solution) -> tuple[Estimate, ...]:
 
 
 def _unit(name: str) -> str:
+    """Unit of a parameter by its name."""
     for part, unit in _UNITS.items():
         if part in name:
             return unit

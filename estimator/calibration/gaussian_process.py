@@ -1,8 +1,9 @@
-"""Gaussian process over the floor: Matern-3/2 with Student-t noise, hyperparameters by leave-one-out.
+"""Gaussian process regression over the ground: Matern-3/2 kernel, Student-t noise, leave-one-out hyperparameters.
 
 k(p, q) = amplitude^2 (1 + u) exp(-u),  u = sqrt(3) |p - q| / length. Student-t noise (4 degrees of freedom) is a scale
-mixture of Gaussians, so that it is solved by reweighting. Leave-one-out residuals and variances come from one inverse
-(Rasmussen and Williams, Gaussian Processes for Machine Learning, Eq. 5.12): a place counts for what the others say.
+mixture of Gaussians, so it is solved by iterative reweighting. Leave-one-out residuals and variances come from one
+matrix inverse (Rasmussen and Williams, Gaussian Processes for Machine Learning, Eq. 5.12). They predict each value from
+all others.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from estimator.numerics.arrays import Array
 
 FREEDOM: Final = 4.0
+"""Degrees of freedom of the Student-t noise."""
 REWEIGHTS: Final = 5
 LENGTHS_M: Final = (0.4, 0.7, 1.0, 1.5, 2.2, 3.2)
 AMPLITUDES: Final = (0.02, 0.035, 0.06, 0.10, 0.16, 0.25)
@@ -25,7 +27,7 @@ NOISES: Final = (0.003, 0.006, 0.012, 0.025, 0.05, 0.09)
 
 @dataclass(frozen=True, slots=True)
 class Hyper:
-    """Amplitude and noise (one sigma of ln strength), correlation length in m."""
+    """Hyperparameters: amplitude and noise (one sigma of ln RSS), correlation length (m)."""
 
     amplitude: float
     length: float
@@ -34,7 +36,7 @@ class Hyper:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """A process with its data: places (n, 2), weights alpha (n,), inverse of the data's covariance (n, n)."""
+    """A process conditioned on data: positions (n, 2), weights alpha (n,), inverse of the data's covariance (n, n)."""
 
     hyper: Hyper
     places: Array
@@ -42,7 +44,7 @@ class Field:
     inverse: Array
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        """Mean and one sigma at places (m, 2)."""
+        """Posterior mean and one sigma at positions (m, 2)."""
         k = matern(self.hyper, places, self.places)
         mean = k @ self.alpha
         variance = self.hyper.amplitude**2 - np.einsum("ij,jk,ik->i", k, self.inverse, k, optimize=True)
@@ -50,20 +52,20 @@ class Field:
 
 
 def matern(hyper: Hyper, a: Array, b: Array) -> Array:
-    """Covariance between places (n, 2) and (m, 2)."""
+    """Covariance (n, m) between positions (n, 2) and (m, 2)."""
     u = math.sqrt(3.0) / hyper.length * np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1])
     covariance: Array = hyper.amplitude**2 * (1.0 + u) * np.exp(-u)
     return covariance
 
 
 def fit(hyper: Hyper, places: Array, values: Array, extra: Array | None = None) -> Field:
-    """Condition on values at places; ``extra`` (n,) is known variance beside the noise."""
+    """Condition the process on values (n,) at positions (n, 2); ``extra`` (n,): known variance besides the noise."""
     field, _, _ = _reweighted(hyper, places, values, np.zeros(len(values)) if extra is None else extra)
     return field
 
 
 def _reweighted(hyper: Hyper, places: Array, values: Array, extra: Array) -> tuple[Field, Array, Array]:
-    """The field with leave-one-out residuals and variances (of the value without its own noise)."""
+    """The conditioned process, with leave-one-out residuals and variances (of the value without its own noise)."""
     covariance = matern(hyper, places, places)
     noise = np.full(len(values), hyper.noise**2) + extra
     base = noise.copy()
@@ -73,14 +75,14 @@ def _reweighted(hyper: Hyper, places: Array, values: Array, extra: Array) -> tup
         diagonal = np.diag(inverse)
         left, spread = alpha / diagonal, np.maximum(1.0 / diagonal - noise, 0.0)
         if turn < REWEIGHTS - 1:
-            # the others' opinion of a value, not one it has a part in, tells whether it is an outlier
+            # leave-one-out: an outlier must not reduce its own residual
             noise = base * (FREEDOM + left**2 / (base + spread)) / (FREEDOM + 1.0)
             noise = np.maximum(noise, base)
     return Field(hyper, places, alpha, inverse), left, spread
 
 
 def score(hyper: Hyper, places: Array, values: Array, extra: Array) -> float:
-    """Sum of log densities of each value given the others (Student-t)."""
+    """Leave-one-out log likelihood: sum of the log density of each value given all others (Student-t)."""
     _, left, spread = _reweighted(hyper, places, values, extra)
     s2 = spread + hyper.noise**2 + extra
     constant = math.lgamma(0.5 * (FREEDOM + 1)) - math.lgamma(0.5 * FREEDOM) - 0.5 * math.log(FREEDOM * math.pi)
@@ -89,9 +91,9 @@ def score(hyper: Hyper, places: Array, values: Array, extra: Array) -> float:
 
 
 def choose(data: Sequence[tuple[Array, Array, Array]]) -> Hyper:
-    """Hyperparameters that predict best what was left out, for several fields (places, values, extra) together.
+    """Hyperparameters with the best leave-one-out likelihood over several fields (positions, values, extra).
 
-    A walk over the grids: one parameter at a time until none improves.
+    Coordinate search over the grids, until no step improves.
     """
     grids = (AMPLITUDES, LENGTHS_M, NOISES)
     known: dict[tuple[int, int, int], float] = {}
@@ -106,7 +108,7 @@ def choose(data: Sequence[tuple[Array, Array, Array]]) -> Hyper:
     while True:
         a, b, c = best
         near = [(a + d, b, c) for d in (-1, 1)] + [(a, b + d, c) for d in (-1, 1)] + [(a, b, c + d) for d in (-1, 1)]
-        # amplitude and length trade against each other, so they are also moved together
+        # amplitude and length are strongly correlated, so they are also moved together
         near += [(a - 1, b - 1, c), (a + 1, b + 1, c)]
         found = max((at for at in near if all(0 <= i < len(g) for i, g in zip(at, grids, strict=True))), key=worth)
         if worth(found) <= worth(best):

@@ -1,8 +1,9 @@
-"""Where lamps hang and how strong they are, from a drive with known poses: nobody wants to measure 200 lamps by hand.
+"""Lamp mapping: positions and powers of unsurveyed lamps from a drive with known poses.
 
-One lamp at a time first: its light is strongest below it, and ln strength falls with distance as Eq. 1 says, so that a
-maximum likelihood fit from the strongest place finds it. Then all lamps together, with what they share: the receiver's
-lean, cosine and lever arm, the diffuse share, the height of the ceiling. The result is in the frame of the drive.
+Nobody wants to measure 200 lamps by hand. Each lamp is first fitted alone. Its RSS is largest below it, and ln RSS
+falls with distance as in Eq. 1, so a maximum-likelihood fit from the position of the largest RSS finds it. A joint fit
+of all lamps follows, with the parameters they share: the receiver's tilt, order and lever arm, the diffuse floor, and
+the height of the ceiling. The result is in the frame of the drive.
 """
 
 from __future__ import annotations
@@ -21,26 +22,30 @@ from estimator.light_filter.survey import Lamp, Receiver, Survey
 from estimator.numerics.arrays import Array
 
 REACH_M: Final = 2.2
-"""A lamp is received up to this many of its heights away (the rim of the field of view is at 1.7)."""
+"""Horizontal range of a lamp, in heights above the receiver (the edge of the field of view is at 1.7)."""
 NEAR_M: Final = 1.5
+"""Radius (m) around the position of the largest RSS over which the peak is averaged."""
 WEAKEST: Final = 0.05
-"""Of the median lamp's greatest strength: what is never stronger is somebody's diffuse light."""
+"""Share of the median lamp's peak RSS; a code whose peak is below is diffuse light of a distant lamp."""
 FEWEST: Final = 20
+"""Observations without which no lamp is mapped."""
 USUAL_HEIGHT_M: Final = 2.6
-"""Above the receiver, where nobody says better."""
+"""Height of the lamps above the receiver, m, where none is given."""
 HEIGHT_SIGMA_M: Final = 0.5
+"""Prior sigma of that height, m."""
 GAIN_LN: Final = 1.2
+"""Prior sigma of ln power."""
 ALONE: Final = Priors(gain=0.0, order=0.2, slope=0.0, place=3.0, floor=0.01, rx_order=0.0, rx_slope=0.0, lever=0.0)
 TOGETHER: Final = Priors(gain=0.0, order=0.1, slope=0.02, place=3.0, floor=0.01, rx_order=0.25, pattern=0.1, glow=0.2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heard:
-    """Received strengths as they came, one element (pose: one row) each.
+    """Received RSS in order of arrival, one element (pose: one row) each.
 
     Attributes:
-        rows: with ``lamp`` the number of the code.
-        lamp_id: what the lamp said it is, -1 where it said nothing.
+        rows: observations; their ``lamp`` is the number of the code.
+        lamp_id: (n,) lamp ID of the data frame, -1 without one.
     """
 
     rows: Rows
@@ -49,13 +54,13 @@ class Heard:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surveyed:
-    """A survey from a drive.
+    """Survey from a drive.
 
     Attributes:
-        found: the joint fit; its survey is the result, in the frame of the drive.
-        sigma: (K, 3) one sigma of x, y, z of each lamp, m. nearest: (K,) how close the drive came, m.
-        height_told: whether the height of the ceiling came from the drive.
-        left_out: codes that were heard but too rarely or too weakly to place.
+        found: joint fit; its survey is the result, in the frame of the drive.
+        sigma: (K, 3) one sigma of x, y, z of each lamp, m. nearest: (K,) smallest distance of the drive to it, m.
+        height_told: whether the drive determined the height of the ceiling.
+        left_out: codes received too rarely or too weakly to be located.
     """
 
     found: Calibrated
@@ -66,16 +71,17 @@ class Surveyed:
 
 
 def survey(heard: Heard, receiver: Receiver, depth: float, height: float | None = None) -> Surveyed:
-    """Place every lamp that was heard.
+    """Locate every received lamp.
 
     Args:
-        heard: strengths with poses.
-        receiver: as far as it is known; lever arm, lean and cosine are refined.
-        depth: of the lamps' modulation.
-        height: z of the lamps above the floor, m; None: estimated as far as the drive tells it.
+        heard: RSS with poses.
+        receiver: prior values; lever arm, tilt and order are refined.
+        depth: modulation depth of the lamps.
+        height: z of the lamps above the ground, m; None: estimated as far as the drive determines it.
 
     Raises:
-        TooLittle: no lamp was heard often enough.
+        TooLittle: no lamp was received often enough.
+        ValueError: the lamps are not above the receiver.
     """
     z = receiver.z + USUAL_HEIGHT_M if height is None else height
     if z < receiver.z + 0.3:
@@ -92,7 +98,7 @@ def survey(heard: Heard, receiver: Receiver, depth: float, height: float | None 
 
 
 def _groups(heard: Heard, reach: float) -> tuple[list[tuple[int, int, Rows]], tuple[int, ...]]:
-    """(lamp ID, code, its rows) by lamp, thinned; and codes of which no lamp could be made."""
+    """Thinned rows by lamp as (lamp ID, code, rows), and the codes that yielded no lamp."""
     codes = np.unique(heard.rows.lamp)
     peaks = [float(heard.rows.amplitude[heard.rows.lamp == code].max()) for code in codes]
     least = WEAKEST * float(np.median(peaks)) if peaks else 0.0
@@ -108,7 +114,7 @@ def _groups(heard: Heard, reach: float) -> tuple[list[tuple[int, int, Rows]], tu
             said = said[said >= 0]
             name = int(np.bincount(said).argmax()) if len(said) else next(free)
             if name in taken:
-                continue  # the same lamp by its own word: what is left of its light by way of walls
+                continue  # same lamp ID in its data frame: reflected light of the same lamp
             taken.add(name)
             groups.append((name, code, thinned(heard.rows.chosen(mine[part]))))
         if not parts:
@@ -117,7 +123,7 @@ def _groups(heard: Heard, reach: float) -> tuple[list[tuple[int, int, Rows]], tu
 
 
 def _apart(rows: Rows, reach: float, least: float) -> list[Index]:
-    """Rows of one code by lamp: round the strongest place, then round the strongest of what is left, and so on."""
+    """Split the rows of one code by lamp: around the peak RSS, then around the peak of the rest, and so on."""
     rest = np.arange(len(rows))
     found: list[Index] = []
     while len(rest) >= FEWEST and rows.amplitude[rest].max() > least:
@@ -132,7 +138,7 @@ def _apart(rows: Rows, reach: float, least: float) -> list[Index]:
 
 
 def _peak(rows: Rows) -> Array:
-    """About where the light is strongest: the mean of places near the strongest, weighted by strength squared."""
+    """Approximate position of the largest RSS: mean of the positions near it, weighted by RSS squared."""
     top = rows.pose[int(np.argmax(rows.amplitude)), :2]
     near = np.hypot(*(rows.pose[:, :2] - top).T) < NEAR_M
     weight = rows.amplitude[near] ** 2
@@ -141,7 +147,7 @@ def _peak(rows: Rows) -> Array:
 
 
 def _alone(rows: Rows, lamp: Lamp, receiver: Receiver, depth: float) -> Lamp:
-    """One lamp by itself, from where its light is strongest."""
+    """Fit one lamp alone, starting from the position of its largest RSS."""
     x, y = _peak(rows)
     first = Survey((replace(lamp, x=float(x), y=float(y), sigma_ln=GAIN_LN),), receiver, depth=depth)
     rows = replace(rows, lamp=np.zeros(len(rows), dtype=np.int64))
@@ -154,7 +160,7 @@ def _alone(rows: Rows, lamp: Lamp, receiver: Receiver, depth: float) -> Lamp:
 
 
 def _with_gain(before: Array, rows: Rows, lamp: Lamp, receiver: Receiver, depth: float) -> Array:
-    """The parameters with a first guess of power: the greatest strength is that of the nadir."""
+    """Parameters with an initial power: the largest RSS is taken as that at the nadir."""
     H = (lamp.order + 1.0) * receiver.area_m2 / (2.0 * np.pi * (lamp.z - receiver.z) ** 2)
     nadir = receiver.responsivity * depth * lamp.power_w * H
     before = before.copy()
@@ -163,6 +169,7 @@ def _with_gain(before: Array, rows: Rows, lamp: Lamp, receiver: Receiver, depth:
 
 
 def _surveyed(found: Calibrated, free_height: bool, left_out: tuple[int, ...]) -> Surveyed:
+    """Assemble the result: sigmas and smallest distances by lamp."""
     K = len(found.survey.lamps)
     sigma = np.zeros((K, 3))
     by_name: Mapping[tuple[int | None, str], float] = {(e.lamp_id, e.name): e.sigma for e in found.estimates}

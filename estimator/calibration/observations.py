@@ -1,7 +1,7 @@
-"""What calibration works on: received strengths with the places they were received at, thinned to what is independent.
+"""Calibration observations: RSS with pose and lamp, thinned to independent rows, and the lamp model at them.
 
-A robot that stands still for a minute says one thing, not a thousand. Strengths of one lamp from one cell of the floor
-and one sector of headings are therefore one row: their median, so that a passer-by does not pull it.
+A robot at rest for a minute adds no new information. There is therefore one row for each lamp, cell of the ground and
+sector of headings. It is the median, which a passer-by does not shift.
 """
 
 from __future__ import annotations
@@ -20,19 +20,25 @@ from estimator.numerics.jit import kernel
 Index = npt.NDArray[np.int64]
 
 CELL_M: Final = 0.10
+"""Side of a thinning cell of the ground, m."""
 SECTORS: Final = 8
+"""Number of heading sectors."""
 PATCH_M: Final = 2.0
-"""Model errors (walls, the lamp's own pattern) are alike within such a patch of floor: the way over which the `lights`
-filter lets them fade too."""
+"""Side of a patch of ground (m) in which model errors (walls, the lamp's own pattern) are correlated. In the light
+filter they fade over the same path length.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Received strengths; all arrays have one element (pose: one row) per strength.
+    """Received RSS; all arrays have one element (pose: one row) per observation.
 
     Attributes:
-        pose: (n, 3) of the base (x, y, yaw) in the frame of the drive. lamp: index into the lamps.
-        amplitude: A. sigma: one sigma of ln amplitude from noise alone. t: s, for people and for splitting a drive.
+        pose: (n, 3) of the base (x, y, yaw) in the frame of the drive. lamp: (n,) index of the lamp.
+        amplitude: RSS, A. sigma: one sigma of ln RSS from noise alone. t: s, for plots and for splitting a drive.
+
+    Raises:
+        ValueError: unequal lengths, values that are not finite, RSS not positive or noise negative.
     """
 
     pose: Array
@@ -42,7 +48,7 @@ class Rows:
     t: Array
 
     def __post_init__(self) -> None:
-        """Refuse what no drive can hold; raises ValueError."""
+        """Check lengths and values; raises ValueError."""
         n = len(self.lamp)
         shapes = [self.pose.shape == (n, 3), *(a.shape == (n,) for a in (self.amplitude, self.sigma, self.t))]
         if not all(shapes):
@@ -55,19 +61,19 @@ class Rows:
         return len(self.lamp)
 
     def chosen(self, which: npt.NDArray[np.bool_] | Index) -> Rows:
-        """Some of the rows."""
+        """Subset of the rows, by mask or index."""
         return Rows(self.pose[which], self.lamp[which], self.amplitude[which], self.sigma[which], self.t[which])
 
 
 def joined(parts: Sequence[Rows]) -> Rows:
-    """Several as one."""
+    """Concatenation of several parts."""
     fields = zip(*((p.pose, p.lamp, p.amplitude, p.sigma, p.t) for p in parts), strict=True)
     pose, lamp, amplitude, sigma, t = (np.concatenate(list(field)) for field in fields)
     return Rows(pose, lamp, amplitude, sigma, t)
 
 
 def thinned(rows: Rows, cell: float = CELL_M) -> Rows:
-    """One row per lamp, cell of the floor and sector of headings: the strength that is the median of its cell."""
+    """One row per lamp, cell of the ground (side ``cell``, m) and heading sector: that of the median RSS of the cell."""
     if not len(rows):
         return rows
     sector = np.floor((rows.pose[:, 2] / (2.0 * np.pi) % 1.0) * SECTORS)
@@ -82,7 +88,7 @@ def thinned(rows: Rows, cell: float = CELL_M) -> Rows:
 
 
 def patches(pose: Array, lamp: Index, size: float = PATCH_M) -> Index:
-    """(n,) a number for each patch of floor and lamp; strengths of one patch share their model error."""
+    """(n,) number of the patch of each row (lamp and square of ground); rows of one patch share their model error."""
     keys = np.column_stack((lamp, np.floor(pose[:, :2] / size))).astype(np.int64)
     numbers: Index = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
     return numbers
@@ -97,7 +103,7 @@ def expect_rows(lamps: Array, which: Index, rx: Array, poses: Array, floor: floa
 
 
 def model(lamps: Array, rx: Array, rows_pose: Array, which: Index, floor: float) -> tuple[Array, Array]:
-    """What is expected per row: (n, 3) of amplitude, direct part, cos(beta), and (n, 17) Jacobian of ln amplitude."""
+    """Expected RSS per row: (n, 3) of RSS (A), direct part (A), cos(beta); and the (n, 17) Jacobian of ln RSS."""
     n = len(which)
     out, J = np.zeros((n, 3)), np.zeros((n, COLUMNS))
     expect_rows(lamps, which, rx, np.ascontiguousarray(rows_pose), floor, (out, J))

@@ -1,8 +1,8 @@
-"""Odometry and laser mount from one drive: what the wheels say against what the laser saw.
+"""Odometry and lidar mount calibration from one drive: wheel odometry compared with lidar poses.
 
-The laser moves as X^-1 W X, if W is the wheels' motion of the base and X the laser's place on it (simultaneous
-calibration; A. Censi et al., IEEE Trans. Robotics 29, 2013). Wheels are wrong by a scale of distances, a scale of turns
-(their track: turns are measured over it) and a turn per metre (wheels of unequal size).
+The lidar moves as X^-1 W X: W is the motion of the base by odometry, X the pose of the lidar on the base
+(simultaneous calibration; A. Censi et al., IEEE Trans. Robotics 29, 2013). Odometry errors are a scale of distance, a
+scale of turns (their track: turns are measured over it) and a turn per metre (wheels of unequal size).
 """
 
 from __future__ import annotations
@@ -16,12 +16,17 @@ import numpy as np
 from estimator.numerics.arrays import Array
 
 STEP_M: Final = 0.4
+"""Distance of one step, m."""
 STEP_RAD: Final = 0.35
+"""Turn of one step, rad."""
 FEWEST: Final = 12
+"""Steps without which nothing is fitted."""
 NOISE: Final = (0.01, 0.01, 0.006)
-"""First guess of the spread of a step (m, m, rad); the residuals tell the rest."""
+"""Initial sigma of a step (m, m, rad); later rounds take it from the residuals."""
 PRIOR: Final = (0.1, 0.15, 0.05, 0.15, 0.15, 0.15)
+"""Prior sigmas, in the order of :class:`Wheel`."""
 TOLD: Final = 0.5
+"""The drive determines a parameter if it reduces the sigma below this share of the prior sigma."""
 
 
 class Wheel(IntEnum):
@@ -37,12 +42,12 @@ class Wheel(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WheelFit:
-    """What a drive says.
+    """Result of the odometry calibration.
 
     Attributes:
-        value, sigma: (6,) by :class:`Wheel`. told: (6,) whether the drive says more than was known.
-        before, after: RMS of steps, (m, rad) each. steps: how many.
-        off_before, off_after: (k, 3) wheels less laser of each step, x, y in m and yaw in rad, as the laser sees them.
+        value, sigma: (6,) by :class:`Wheel`. told: (6,) whether the drive determined the parameter.
+        before, after: RMS of the step residuals, (m, rad) each. steps: number of steps.
+        off_before, off_after: (k, 3) odometry minus lidar of each step, x, y in m and yaw in rad, in the lidar's frame.
     """
 
     value: Array
@@ -56,15 +61,15 @@ class WheelFit:
 
 
 def fit_wheels(odometry: Array, laser: Array, mount: Array) -> WheelFit:
-    """Fit scales and mount.
+    """Fit odometry scales and lidar mount.
 
     Args:
-        odometry: (n, 3) poses as the wheels sum them up.
-        laser: (n, 3) of the laser in its map, at the same instants.
-        mount: (3,) x, y, yaw of the laser on the base as configured.
+        odometry: (n, 3) poses by odometry.
+        laser: (n, 3) poses of the lidar in its map, at the same instants.
+        mount: (3,) x, y, yaw of the lidar on the base as configured.
 
     Raises:
-        ValueError: too little motion; says how much there is.
+        ValueError: too little motion; the message gives the number of steps.
     """
     from scipy.optimize import least_squares
 
@@ -92,7 +97,7 @@ def fit_wheels(odometry: Array, laser: Array, mount: Array) -> WheelFit:
 
 
 def _steps(odometry: Array, laser: Array) -> tuple[Array, Array]:
-    """Relative motions (k, 3) of both between instants that are a step apart."""
+    """Relative motions (k, 3) of odometry and lidar between instants one step apart."""
     at = [0]
     for i in range(1, len(odometry)):
         last = odometry[at[-1]]
@@ -103,7 +108,7 @@ def _steps(odometry: Array, laser: Array) -> tuple[Array, Array]:
 
 
 def _residuals(p: Array, W: Array, L: Array) -> Array:
-    """(k, 3) laser's motion as the wheels and the mount say, less as it was seen."""
+    """(k, 3) motion of the lidar predicted from odometry and mount, minus the measured one."""
     way = np.hypot(W[:, 0], W[:, 1]) * np.sign(W[:, 0])
     yaw = p[Wheel.TURN] * W[:, 2] + p[Wheel.DRIFT] * way
     half = 0.5 * (yaw - W[:, 2])
@@ -118,7 +123,7 @@ def _residuals(p: Array, W: Array, L: Array) -> Array:
 
 
 def _between(a: Array, b: Array) -> Array:
-    """(k, 3) b seen from a."""
+    """(k, 3) pose of b relative to a."""
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
     turn = (b[:, 2] - a[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
@@ -126,7 +131,7 @@ def _between(a: Array, b: Array) -> Array:
 
 
 def _compose(a: Array, b: Array) -> Array:
-    """(k, 3) a then b."""
+    """(k, 3) composition of a and b."""
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     return np.column_stack(
         (a[:, 0] + c * b[:, 0] - s * b[:, 1], a[:, 1] + s * b[:, 0] + c * b[:, 1], a[:, 2] + b[:, 2])
@@ -134,9 +139,10 @@ def _compose(a: Array, b: Array) -> Array:
 
 
 def on_base(poses: Array, mount: Array) -> Array:
-    """(n, 3) poses of the laser, from poses of the base and the mount they were computed with."""
+    """(n, 3) poses of the lidar, from poses of the base and the mount that these were computed with."""
     return _compose(poses, np.tile(mount, (len(poses), 1)))
 
 
 def _rms(off: Array) -> tuple[float, float]:
+    """RMS of the residuals: position (m), yaw (rad)."""
     return float(np.sqrt(np.mean(off[:, :2] ** 2))), float(np.sqrt(np.mean(off[:, 2] ** 2)))

@@ -1,7 +1,7 @@
-"""What calibration may change, how surely it was known before, and how the received strengths depend on it.
+"""Calibration parameter vector with priors, and the Jacobian of the RSS with respect to it.
 
-The parameters stand in one vector: those common to all lamps first, then each lamp's. Each has a value before and a
-prior sigma; a sigma of zero takes it as given. What a drive does not tell stays where its prior holds it.
+The parameters common to all lamps come first, then those of each lamp. Each has a prior value and a prior sigma; a
+sigma of zero fixes the parameter. A parameter that the drive does not determine stays at its prior.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class Common(IntEnum):
     RX_SLOPE_Y = 4
     RX_X = 5  # lever arm, m
     RX_Y = 6
-    FRAME_X = 7  # where the drive's frame lies in the survey's, m
+    FRAME_X = 7  # pose of the drive's frame in the survey's, m
     FRAME_Y = 8
     FRAME_YAW = 9
     HEIGHT = 10  # of all lamps, m
-    BULGE = 11  # departure of the lamps' type from cos^m between axis and rim, ln
-    OVAL_C = 12  # by which the type is wider along x than along y, ln
+    BULGE = 11  # departure of the luminaire type from cos^m between axis and edge, ln
+    OVAL_C = 12  # excess width of the luminaire type along x over y, ln
     OVAL_S = 13  # the same along the diagonals
 
 
@@ -48,7 +48,7 @@ class Own(IntEnum):
     X = 4  # m
     Y = 5
     Z = 6
-    GLOW_EAST = 7  # light by way of a wall on that side, 1 m from the lamp, as a share of the direct light at its nadir
+    GLOW_EAST = 7  # light reflected by a wall on that side, 1 m from the lamp, as a share of the direct light at nadir
     GLOW_WEST = 8
     GLOW_NORTH = 9
     GLOW_SOUTH = 10
@@ -61,29 +61,33 @@ _OWN_COLUMNS: Final = (Wrt.GAIN, Wrt.ORDER, Wrt.LAMP_SLOPE_X, Wrt.LAMP_SLOPE_Y, 
 LEAST_ORDER: Final = 0.05
 LARGEST_SLOPE: Final = 0.5
 RIM_RAD: Final = 0.07
-"""Nearer than this to the edge of the field of view nobody knows how much comes through."""
+"""Closer than this to the edge of the field of view the transmission is uncertain."""
 DARKEST: Final = 0.002
-"""Of the diffuse share: no room is darker, and a filter that starts from nothing could not tell it."""
+"""Smallest diffuse floor: no room is darker, and a filter that starts from zero could not estimate it."""
 LEAST_FLOOR: Final = 0.015
+"""Smallest diffuse floor that counts in the uncertainty of an observation."""
 BREADTH_M: Final = 1.7
+"""Sigma of the wall reflection along the wall, m."""
 FADING_M: Final = 1.2
+"""Length (m) over which the wall reflection falls by a factor of e."""
 FARTHEST_M: Final = 3.0
+"""Distance towards the wall (m) beyond which the reflection no longer grows."""
 FLOOR_DOUBT: Final = 0.5
-"""By how much of itself the diffuse part may differ from place to place."""
+"""One sigma of the diffuse part from position to position, as a share of it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Priors:
-    """One sigma before the drive; zero: taken as given. Slopes are metres per metre, gains ln.
+    """Prior sigmas; zero fixes the parameter. Tilts are in m/m, gains in ln.
 
     Attributes:
         gain: common to all lamps (the receiver's own, dimming). Each lamp's own is the survey's ``sigma_ln``.
-        order: Lambert orders, as a part of ``0.5 + order``. slope: of lamps. place: of lamps in x and y, z: in z.
-        floor: the diffuse share. rx_order, rx_slope, lever: the receiver.
-        frame, frame_yaw: where the drive's frame lies in the survey's. height: common to all lamps.
-        pattern: departure of the lamps' type from Lambert's law, ln. glow: of each lamp by way of walls, by side.
-            Only a survey by drive looks for these two, so that lamps at the edge of the way are not drawn aside; they
-            cannot be kept in a survey.
+        order: Lambert orders, as a share of ``0.5 + order``. slope: tilt of lamps. place: of lamps in x and y, z: in z.
+        floor: the diffuse floor. rx_order, rx_slope, lever: the receiver.
+        frame, frame_yaw: pose of the drive's frame in the survey's. height: common to all lamps.
+        pattern: departure of the luminaire type from Lambert's law, ln. glow: wall reflection of each lamp, by side.
+            Only lamp mapping frees these two, so that lamps at the edge of the trajectory are not biased. They cannot
+            be stored in a survey.
     """
 
     gain: float = 0.5
@@ -104,10 +108,10 @@ class Priors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """A survey as a vector of parameters.
+    """Calibration problem: a survey as a parameter vector.
 
     Attributes:
-        survey: as it was. before, prior: (p,) values and sigmas. lamps, receiver: tables of
+        survey: prior survey. before, prior: (p,) values and sigmas. lamps, receiver: tables of
         `estimator.light_filter.lambertian`.
     """
 
@@ -118,27 +122,28 @@ class Problem:
     receiver: Array = field(init=False)
 
     def __post_init__(self) -> None:
+        """Pack the tables for the kernels."""
         object.__setattr__(self, "lamps", pack_lamps(self.survey.lamps, self.survey.depth))
         object.__setattr__(self, "receiver", pack_receiver(self.survey.receiver))
 
     @property
     def free(self) -> npt.NDArray[np.int64]:
-        """Numbers of the parameters that may change."""
+        """Indices of the free parameters."""
         return np.flatnonzero(self.prior > 0.0)
 
     def own(self, lamp: int) -> slice:
-        """Where a lamp's parameters stand."""
+        """Slice of a lamp's parameters."""
         begin = COMMONS + OWNS * lamp
         return slice(begin, begin + OWNS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
-    """The model at some parameters, per row.
+    """Model linearised at some parameters, per row.
 
     Attributes:
-        residual: ln received over expected. common: (n, COMMONS), own: (n, OWNS) derivatives of ln expected.
-        doubt: the part of the amplitude that is diffuse and uncertain. seen: whether the row is in plain view.
+        residual: ln(received / expected). common: (n, COMMONS), own: (n, OWNS) derivatives of ln expected.
+        doubt: share of the RSS that is diffuse and uncertain. seen: whether the lamp is in plain view.
     """
 
     residual: Array
@@ -149,7 +154,7 @@ class Linear:
 
 
 def problem(survey: Survey, priors: Priors) -> Problem:
-    """A survey with what is known of it before the drive."""
+    """Parameter vector and priors of a survey."""
     r = survey.receiver
     common = np.array((0.0, survey.floor, r.order, r.slope_x, r.slope_y, r.x, r.y, *[0.0] * 7))
     p = priors
@@ -168,7 +173,7 @@ def problem(survey: Survey, priors: Priors) -> Problem:
 
 
 def bounded(theta: Array) -> Array:
-    """Parameters pulled back to what can be."""
+    """Parameters clipped to physical limits."""
     theta = theta.copy()
     own = theta[COMMONS:].reshape(-1, OWNS)
     theta[Common.FLOOR] = max(theta[Common.FLOOR], DARKEST)
@@ -204,17 +209,17 @@ def linear(task: Problem, rows: Rows, theta: Array) -> Linear:
 
 
 def _pattern(lamps: Array, pose: Array, z: float) -> Array:
-    """(n, 3) how the departures from Lambert's law act at each row; how they change with place is left out."""
+    """(n, 3) derivatives of ln RSS by the departures from Lambert's law; their change with position is neglected."""
     dx, dy, h = pose[:, 0] - lamps[:, 0], pose[:, 1] - lamps[:, 1], lamps[:, 2] - z
     d2 = dx**2 + dy**2 + h**2
     return np.column_stack((4.0 * (d2 - h**2) * h**2 / d2**2, (dx**2 - dy**2) / d2, 2.0 * dx * dy / d2))
 
 
 def _glow(lamps: Array, pose: Array, share: Array, own: Array) -> tuple[Array, Array]:
-    """(n,) ln that light by way of walls adds, and its derivatives (n, 4); ``share``: d ln amplitude / d floor.
+    """(n,) ln RSS added by wall reflections, and its derivatives (n, 4); ``share``: d ln RSS / d floor.
 
-    Light from the lit patch of a wall beside a lamp fades about exponentially with the distance from the wall, so that
-    where the wall stands does not matter, and like a bell along it.
+    Light from the lit patch of a wall beside a lamp fades about exponentially with the distance from the wall. The
+    position of the wall therefore does not matter. Along the wall it follows a Gaussian.
     """
     way = pose[:, :2] - lamps[:, :2]
     sides = np.column_stack((way[:, 0], -way[:, 0], way[:, 1], -way[:, 1]))
@@ -225,7 +230,7 @@ def _glow(lamps: Array, pose: Array, share: Array, own: Array) -> tuple[Array, A
 
 
 def placed(theta: Array, pose: Array) -> Array:
-    """Poses of the drive in the survey's frame."""
+    """(n, 3) poses of the drive in the survey's frame."""
     x, y, yaw = theta[Common.FRAME_X], theta[Common.FRAME_Y], theta[Common.FRAME_YAW]
     c, s = np.cos(yaw), np.sin(yaw)
     there = (x + c * pose[:, 0] - s * pose[:, 1], y + s * pose[:, 0] + c * pose[:, 1], pose[:, 2] + yaw)
@@ -233,6 +238,7 @@ def placed(theta: Array, pose: Array) -> Array:
 
 
 def _tables(task: Problem, theta: Array) -> tuple[Array, Array]:
+    """Tables of lamps and receiver at ``theta``, for the kernels."""
     own = theta[COMMONS:].reshape(-1, OWNS)
     lamps = task.lamps.copy()
     lamps[:, 0:2], lamps[:, 2] = own[:, Own.X : Own.Y + 1], own[:, Own.Z] + theta[Common.HEIGHT]
@@ -246,7 +252,7 @@ def _tables(task: Problem, theta: Array) -> tuple[Array, Array]:
 
 
 def survey_at(task: Problem, theta: Array, sigma_ln: Array) -> Survey:
-    """The survey with these parameters; ``sigma_ln`` (K,) of the lamps' powers."""
+    """Survey with these parameters; ``sigma_ln`` (K,): one sigma of ln power of the lamps."""
     own = theta[COMMONS:].reshape(-1, OWNS)
     lamps = tuple(_lamp(lamp, theta, row, s) for lamp, row, s in zip(task.survey.lamps, own, sigma_ln, strict=True))
     receiver = replace(
@@ -261,6 +267,7 @@ def survey_at(task: Problem, theta: Array, sigma_ln: Array) -> Survey:
 
 
 def _lamp(lamp: Lamp, theta: Array, own: Array, sigma_ln: float) -> Lamp:
+    """One lamp with its parameters."""
     return replace(
         lamp,
         x=float(own[Own.X]),

@@ -1,4 +1,4 @@
-"""Learns the residual map from a teach drive: what the survey leaves unexplained, over the floor, lamp by lamp."""
+"""Fits the residual map from a teach drive: RSS that the survey leaves unexplained, over the ground, by lamp."""
 
 from __future__ import annotations
 
@@ -15,27 +15,31 @@ from estimator.light_filter.survey import Survey
 from estimator.numerics.arrays import Array
 
 CELL_M: Final = 0.25
+"""Cell of the grids, m."""
 MARGIN_M: Final = 1.0
+"""Margin of the grids around the observations, m."""
 FEWEST: Final = 8
+"""Positions in plain view without which a lamp gets no residual map."""
 SEARCHED: Final = 100
 SEARCHED_LAMPS: Final = 8
-"""Places of a lamp, and lamps, that take part in the choice of hyperparameters."""
+"""Limits of the choice of hyperparameters: `SEARCHED` positions per lamp, and this many lamps."""
 MOST: Final = 700
+"""Most positions of a lamp that the process is conditioned on."""
 FAINT_PART: Final = 0.3
-"""Where less of a lamp than this comes straight, its residual says nothing."""
+"""Smallest direct share of the RSS at which the residual of a lamp is meaningful."""
 
 
 def learn(survey: Survey, rows: Rows, hyper: Hyper | None = None, cell: float = CELL_M) -> ResidualMap:
-    """Learn the map from a teach drive.
+    """Fit the residual map to a teach drive.
 
     Args:
         survey: calibrated; the map is only valid with it.
-        rows: strengths with poses in the survey's frame.
-        hyper: of the process; chosen by leave-one-out where None.
-        cell: of the grids, m.
+        rows: RSS with poses in the survey's frame.
+        hyper: hyperparameters of the process; None: chosen by leave-one-out.
+        cell: cell of the grids, m.
 
     Raises:
-        ValueError: no lamp has eight places in plain view.
+        ValueError: no lamp has eight positions in plain view.
     """
     parts = [_gathered(part, cell) for part in residuals_of(survey, rows)]
     some = [part for part in parts if len(part[1]) >= FEWEST]
@@ -59,11 +63,11 @@ def learn(survey: Survey, rows: Rows, hyper: Hyper | None = None, cell: float = 
 
 
 Part = tuple[Array, Array, Array]
-"""Places (n, 2) of the photodiode, residuals (n,) of ln strength, their variance (n,) from the receiver's noise."""
+"""Positions (n, 2) of the photodiode, residuals (n,) of ln RSS, their variance (n,) from the receiver's noise."""
 
 
 def residuals_of(survey: Survey, rows: Rows) -> list[Part]:
-    """What the survey leaves unexplained, by lamp, where it is in plain view."""
+    """Residuals ln(received / expected) by lamp, where the lamp is in plain view."""
     lamps, receiver = pack_lamps(survey.lamps, survey.depth), pack_receiver(survey.receiver)
     out, _ = model(lamps, receiver, rows.pose, rows.lamp, survey.floor)
     c, s = np.cos(rows.pose[:, 2]), np.sin(rows.pose[:, 2])
@@ -75,7 +79,7 @@ def residuals_of(survey: Survey, rows: Rows) -> list[Part]:
 
 
 def _gathered(part: Part, cell: float) -> Part:
-    """One value per cell, the median of it: a robot that stands still is no reason to believe a place more."""
+    """One value per cell, the median: a robot at rest must not raise the weight of a position."""
     places, values, extra = part
     if not len(values):
         return part
@@ -88,7 +92,7 @@ def _gathered(part: Part, cell: float) -> Part:
 
 
 def _fewer(part: Part, most: int) -> Part:
-    """At most so many places, evenly taken from all."""
+    """At most ``most`` positions, evenly selected."""
     n = len(part[1])
     at = np.unique(np.linspace(0, n - 1, min(n, most)).astype(np.int64))
     places, values, extra = (column[at] for column in part)
@@ -96,5 +100,6 @@ def _fewer(part: Part, most: int) -> Part:
 
 
 def _middle(places: Array) -> Array:
+    """Centre of the bounding box of positions (n, 2)."""
     middle: Array = 0.5 * (places.min(axis=0) + places.max(axis=0))
     return middle

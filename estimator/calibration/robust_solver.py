@@ -1,15 +1,15 @@
-"""Robust least squares over a problem of calibration: Levenberg-Marquardt on ln strength with Cauchy's loss.
+"""Robust least squares of a calibration problem: Levenberg-Marquardt on ln RSS with Cauchy loss.
 
 Cost    sum_i q_i c^2/2 ln(1 + (r_i / (c s_i))^2) + 1/2 sum_k ((theta_k - before_k) / prior_k)^2
-with    s_i^2 = scale^2 (0.03^2 + doubt_i^2) + noise_i^2,   q_i = 1 / (rows in the same patch of floor)
+with    s_i^2 = scale^2 (0.03^2 + doubt_i^2) + noise_i^2,   q_i = 1 / (rows in the same patch of ground)
 
-A thousand rows beside one wall are few facts, because the model's error is the same for all strengths from one patch.
-All of a patch together weigh as one row, so that the priors keep their weight against them.
+The model error is the same for all observations of one patch. A thousand rows beside one wall hold little
+information. All rows of a patch together weigh as one row, so that the priors keep their weight against them.
 
-The scale is found from the residuals themselves (median absolute deviation) and the fit repeated. A strength far below
-what is expected was blocked, one far above came by a mirror or from another lamp: both are left out after the first
-round. The covariance is the larger, parameter by parameter, of two: that of as many facts as there are patches, and
-White's sandwich over patches, which shows what really scatters (H. White, Econometrica 48, 1980).
+The scale is estimated from the residuals (median absolute deviation) and the fit is repeated. RSS far below the
+expectation was blocked; RSS far above it came by a mirror or from another lamp. Both are rejected after the first
+round. The covariance is the larger of two, parameter by parameter. One counts each patch as one observation. The other
+is White's sandwich over patches, which shows the actual scatter (H. White, Econometrica 48, 1980).
 """
 
 from __future__ import annotations
@@ -27,29 +27,32 @@ from estimator.numerics.arrays import Array
 Mask = npt.NDArray[np.bool_]
 
 ROUNDS: Final = 5
+"""Fits, with a new scale after each."""
 STEPS: Final = 40
+"""Most steps of one fit."""
 CAUCHY: Final = 2.385
-"""95 % efficiency with Gaussian errors."""
+"""Constant c of the Cauchy loss: 95 % efficiency with Gaussian errors."""
 BLOCKED: Final = -3.5
 STRANGE: Final = 5.0
-"""Residuals in sigmas beyond which a row is left out."""
+"""Residuals in sigmas below `BLOCKED` or above this are rejected."""
 MODEL_LN: Final = 0.03
-"""What the model leaves unexplained of ln strength in a usual room."""
+"""One sigma of ln RSS that the model does not explain in a usual room."""
 FIRST_SCALE: Final = 4.0
 LEAST_SCALE: Final = 0.05
-"""In units of `MODEL_LN`."""
+"""Smallest scale; scales are in units of `MODEL_LN`."""
 MAD: Final = 1.4826
+"""Sigma over median absolute deviation of a Gaussian."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """What came out.
+    """Result of the solver.
 
     Attributes:
-        theta: (p,) parameters. covariance: (p, p), zero for parameters taken as given.
-        used: (n,) rows in plain view that were not left out. residual: (n,) ln received over expected. scale: of ln
-            strength, what the model leaves unexplained where it is best.
-        cost: at the end. converged: whether the last steps were small.
+        theta: (p,) parameters. covariance: (p, p), zero for fixed parameters.
+        used: (n,) rows in plain view that were not rejected. residual: (n,) ln(received / expected).
+        scale: one sigma of ln RSS that the model does not explain where it is best.
+        cost: final cost. converged: whether the last steps were small.
     """
 
     theta: Array
@@ -62,7 +65,7 @@ class Solution:
 
 
 def solve(task: Problem, rows: Rows, start: Array | None = None) -> Solution:
-    """Fit; ``start`` (p,) where to begin, the values before where None."""
+    """Solve the problem, starting at ``start`` (p,), or at the prior values where it is None."""
     theta = bounded(task.before if start is None else start)
     scale, used = FIRST_SCALE, np.ones(len(rows), dtype=np.bool_)
     cost, converged = 0.0, False
@@ -70,7 +73,7 @@ def solve(task: Problem, rows: Rows, start: Array | None = None) -> Solution:
         here = linear(task, rows, theta)
         used = here.seen & (_in_sigmas(here, rows, scale, BLOCKED, STRANGE) if turn > 0 else True)
         theta, cost, converged = _descend(task, rows.chosen(used), theta, scale)
-        # of all that is in plain view, left out or not: the scale of what was kept would shrink round by round
+        # over all rows in plain view, rejected or not: the scale of those kept would shrink round by round
         scale = _scale(linear(task, rows.chosen(here.seen), theta), rows.chosen(here.seen), task)
     last = linear(task, rows, theta)
     covariance = _covariance(task, rows.chosen(used), theta, scale)
@@ -78,18 +81,19 @@ def solve(task: Problem, rows: Rows, start: Array | None = None) -> Solution:
 
 
 def sigmas(here: Linear, rows: Rows, scale: float) -> Array:
-    """One sigma of each residual."""
+    """(n,) one sigma of each residual."""
     total: Array = np.sqrt(scale**2 * (MODEL_LN**2 + here.doubt**2) + rows.sigma**2)
     return total
 
 
 def _in_sigmas(here: Linear, rows: Rows, scale: float, low: float, high: float) -> Mask:
+    """(n,) whether each residual lies between two limits in sigmas."""
     share = here.residual / sigmas(here, rows, scale)
     return (share > low) & (share < high)
 
 
 def _scale(here: Linear, rows: Rows, task: Problem) -> float:
-    """What the residuals show beyond noise, corrected for the number of parameters spent on them."""
+    """Scale of the residuals beyond noise, corrected for the number of free parameters."""
     n, spent = len(rows), len(task.free)
     if n < 3:
         return FIRST_SCALE
@@ -99,13 +103,14 @@ def _scale(here: Linear, rows: Rows, task: Problem) -> float:
 
 
 def _importance(rows: Rows) -> Array:
-    """(n,) each row's part in its patch."""
+    """(n,) weight of each row in its patch; the weights of a patch sum to one."""
     groups = patches(rows.pose, rows.lamp)
     part: Array = 1.0 / np.bincount(groups)[groups] if len(rows) else np.zeros(0)
     return part
 
 
 def _cost(task: Problem, here: Linear, s: Array, q: Array, theta: Array) -> float:
+    """Cost of the residuals (Cauchy) and of the priors; ``s``: (n,) sigmas, ``q``: (n,) weights in the patch."""
     share = here.residual / s
     free = task.free
     held = (theta[free] - task.before[free]) / task.prior[free]
@@ -113,12 +118,13 @@ def _cost(task: Problem, here: Linear, s: Array, q: Array, theta: Array) -> floa
 
 
 def _weight(here: Linear, s: Array) -> Array:
+    """(n,) weights of the reweighted least squares."""
     weight: Array = 1.0 / (s * s * (1.0 + (here.residual / (CAUCHY * s)) ** 2))
     return weight
 
 
 def _normal(task: Problem, rows: Rows, here: Linear, weight: Array) -> tuple[Array, Array]:
-    """Matrix and right-hand side of the weighted normal equations, without priors, all parameters."""
+    """Matrix and right-hand side of the weighted normal equations, without priors, for all parameters."""
     p = len(task.before)
     A, b = np.zeros((p, p)), np.zeros(p)
     for lamp in range(len(task.lamps)):
@@ -134,6 +140,7 @@ def _normal(task: Problem, rows: Rows, here: Linear, weight: Array) -> tuple[Arr
 
 
 def _descend(task: Problem, rows: Rows, theta: Array, scale: float) -> tuple[Array, float, bool]:
+    """Levenberg-Marquardt at a fixed scale; returns parameters, cost and whether it converged."""
     free = task.free
     held = np.diag(1.0 / task.prior[free] ** 2)
     here = linear(task, rows, theta)
@@ -162,7 +169,7 @@ def _descend(task: Problem, rows: Rows, theta: Array, scale: float) -> tuple[Arr
 
 
 def _covariance(task: Problem, rows: Rows, theta: Array, scale: float) -> Array:
-    """The larger of sandwich and information, see above; zero for what was taken as given."""
+    """The larger of sandwich and inverse information, see above; zero for fixed parameters."""
     p, free = len(theta), task.free
     here = linear(task, rows, theta)
     weight = _importance(rows) * _weight(here, sigmas(here, rows, scale))
@@ -179,7 +186,7 @@ def _covariance(task: Problem, rows: Rows, theta: Array, scale: float) -> Array:
 
 
 def _scores(task: Problem, rows: Rows, here: Linear, weight: Array) -> Array:
-    """(patches, p) the pull of each patch on every parameter."""
+    """(patches, p) score of each patch: weighted residuals times derivatives, summed over the patch."""
     groups = patches(rows.pose, rows.lamp)[:, None]
     scores = np.zeros((int(groups.max(initial=0)) + 1, len(task.before)))
     pull = (weight * here.residual)[:, None]

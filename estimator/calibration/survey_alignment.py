@@ -1,4 +1,4 @@
-"""Where a drive's frame lies in a survey's: lamps located by the drive against the lamps of the survey, by code."""
+"""Alignment of a drive's frame to the lamp survey: lamps located by the drive matched to surveyed lamps by code."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from estimator.light_filter.survey import Lamp, Survey
 from estimator.numerics.arrays import Array
 
 FITS_M: Final = 0.5
-"""A located lamp fits a surveyed one this near; both are good to decimetres."""
+"""Largest distance (m) between a located lamp and its surveyed one; both are good to decimetres."""
 
 
 class Unaligned(ValueError):
-    """Too few lamps, or none that fit; the text says which."""
+    """Too few lamps, or none that agree; the message names which."""
 
 
 def align(survey: Survey, located: Survey) -> Array:
-    """T_survey_drive (x, y, yaw) under which most located lamps lie on surveyed ones of their code.
+    """T_survey_drive (x, y, yaw) that brings the most located lamps onto surveyed ones of their code.
 
-    Every pair of lamps of two codes proposes a transform; the one with most lamps behind it is refined by all of them
-    (closed form, Eq. 13 of the paper).
+    Every pair of lamps of two codes proposes a transform. The one with the most matching lamps is refined by all of
+    these (closed form, Eq. 13 of the paper).
 
     Raises:
         Unaligned: fewer than two lamps agree.
@@ -47,7 +47,7 @@ def align(survey: Survey, located: Survey) -> Array:
 
 
 def closed(pairs: list[tuple[Lamp, Lamp]]) -> Array:
-    """Least squares over pairs (located, surveyed)."""
+    """Least-squares transform (x, y, yaw) over pairs (located, surveyed)."""
     q = np.array([(a.x, a.y) for a, _ in pairs])
     p = np.array([(b.x, b.y) for _, b in pairs])
     dq, dp = q - q.mean(axis=0), p - p.mean(axis=0)
@@ -58,7 +58,7 @@ def closed(pairs: list[tuple[Lamp, Lamp]]) -> Array:
 
 
 def _behind(T: Array, pairs: list[tuple[Lamp, Lamp]]) -> list[tuple[Lamp, Lamp]]:
-    """Pairs that fit a transform."""
+    """Pairs that a transform brings within `FITS_M` of each other."""
     c, s = math.cos(T[2]), math.sin(T[2])
     return [
         (a, b) for a, b in pairs if math.hypot(T[0] + c * a.x - s * a.y - b.x, T[1] + s * a.x + c * a.y - b.y) < FITS_M
@@ -66,4 +66,5 @@ def _behind(T: Array, pairs: list[tuple[Lamp, Lamp]]) -> list[tuple[Lamp, Lamp]]
 
 
 def _apart(a: Lamp, b: Lamp) -> float:
+    """Horizontal distance of two lamps, m."""
     return math.hypot(a.x - b.x, a.y - b.y)
