@@ -73,7 +73,7 @@ def joined(parts: Sequence[Rows]) -> Rows:
 
 
 def thinned(rows: Rows, cell: float = CELL_M) -> Rows:
-    """One row per lamp, cell of the ground (side ``cell``, m) and heading sector: that of the median RSS of the cell."""
+    """One row per lamp, cell of the ground (side ``cell``, m) and heading sector: that of the median RSS."""
     if not len(rows):
         return rows
     sector = np.floor((rows.pose[:, 2] / (2.0 * np.pi) % 1.0) * SECTORS)

@@ -1,1 +1,1 @@
-"""CDMA receiver (Sect. 2): ADC sample blocks to `LightEpoch`, the decoded lamps and their received strengths."""
+"""CDMA receiver (Sect. 2): ADC sample blocks to `LightEpoch`, the decoded lamps and their RSS."""

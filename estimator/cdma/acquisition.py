@@ -1,9 +1,9 @@
-"""Cold acquisition: which codes are in a block, and at what phase, without knowing anything but the air interface.
+"""Cold acquisition by FFT: finds codes and code phases in a block, given only the air interface.
 
-A block from which mains and all known lamps have been taken out is correlated, by FFT, with one period of every code;
-the sum of magnitudes over the code periods touched needs no data signs. The work is cut into slices of as many codes as
-the caller can afford. Strong lamps hide weak ones, so only those within `DOMINANCE` of the strongest are believed;
-the rest wait for the next block, from which the strong ones will have been taken out.
+A block without mains and tracked lamps is correlated, by FFT, with one period of every code. The sum of magnitudes over
+the code periods touched needs no data signs. The work is cut into slices of as many codes as the caller can afford.
+Strong lamps hide weak ones. Only candidates within `DOMINANCE` of the strongest are accepted; the rest are left for the
+next block, from which the strong lamps are subtracted.
 """
 
 from __future__ import annotations
@@ -29,38 +29,41 @@ from estimator.numerics.arrays import Array
 Index = npt.NDArray[np.int64]
 Spectrum = npt.NDArray[np.complex64]
 Lamps = tuple[Index, Array, Array]
-"""Codes, phases (chips at the middle of the block) and amplitudes."""
+"""Codes, code phases (chips at the middle of the block) and amplitudes."""
 
 THRESHOLD: Final = 5.2
-"""Sum of correlations over its noise, which is measured on the correlations themselves, so that it contains what other
-lamps cause. With 129 codes, 565 phases and 4 sign patterns, noise passes in 6 % of blocks; the next refutes it."""
+"""Detection threshold: sum of correlations over its noise. The noise is measured on the correlations themselves, so it
+contains the interference of other lamps. With 129 codes, 565 phases and 4 sign patterns, noise exceeds it in 6 % of
+blocks; the next block rejects these.
+"""
 
 COLD_THRESHOLD: Final = 7.0
-"""The same while the sample clock is unknown and eleven times as much is tried."""
+"""Detection threshold while the sample clock is unknown and the number of trials is eleven times larger."""
 
 DOMINANCE: Final = 0.35
 """Largest cross-correlation of partial code periods, with margin."""
 
 GUARD_CHIPS: Final = 1.6
-"""The same code is not looked for so near to a lamp that is already tracked (its own side lobes)."""
+"""Distance from a tracked lamp within which its own code is not searched (side lobes)."""
 
 BIN: Final = 0.002
-"""Spacing of trial clocks: 25 us over half a code period of profile A, a quarter of a half chip."""
+"""Spacing of trial clocks (relative): 25 us over half a code period of profile A, a quarter of a half chip."""
 
 FINE_RATES: Final = np.arange(-5, 6) * 4e-4
 FINE_LAGS: Final = np.arange(-2, 3) * 0.25
 SAME_CLOCK: Final = 4e-4
-"""Spectra are computed anew when the clock has moved by so much (a fiftieth of a chip at the ends of a period)."""
+"""Clock change (relative) that makes a spectrum stale: a fiftieth of a chip at the ends of a period."""
 
 STALE: Final = 6
-"""Times as long it takes to try a code whose spectrum is not kept for this clock."""
+"""Cost of a code with a stale spectrum, in codes with a valid one."""
 
 MOST_FOUND: Final = 12
+"""Most candidates of one sweep."""
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A candidate: code, phase in chips at the middle of the searched block, amplitude in ADC steps, significance."""
+    """A candidate: code, phase (chips at the middle of the searched block), amplitude (ADC steps), significance."""
 
     code: int
     phase: float
@@ -73,9 +76,9 @@ class Job:
     """A block to be searched.
 
     Attributes:
-        block: with the residual in place of its photocurrent. t_middle: s. lag: common lag of that block, chips.
-        codes, phases: of each known lamp, lag included. floor: smallest amplitude worth reporting.
-        again: how often lamps found in an earlier sweep over the same block have been taken out.
+        block: with the residual in place of its photocurrent. t_middle: s. lag: common delay of that block, chips.
+        codes, phases: of each tracked lamp, delay included. floor: smallest amplitude worth reporting.
+        again: number of earlier sweeps over the same block whose lamps were subtracted.
     """
 
     block: Sampled
@@ -93,14 +96,14 @@ class Job:
 
 
 Outcome = tuple[Job, float, list[Found]]
-"""What was searched, at which clock, and what was found in it."""
+"""The searched job, the sample clock of the search, and the candidates."""
 
 
 class Search:
-    """Works through one job at a time, `step` by `step`.
+    """FFT search over all codes, one job at a time, in slices (`step`).
 
     Args:
-        profile: air interface. hung: codes that hang here; empty: any may.
+        profile: air interface. hung: codes of lamps in the building; empty: all codes.
     """
 
     def __init__(self, profile: Profile, hung: Collection[int] = ()) -> None:
@@ -127,16 +130,19 @@ class Search:
 
     @property
     def codes(self) -> int:
-        """How many codes a slow sweep tries at most."""
+        """Most codes of a slow sweep."""
         return len(self._hung) - (-len(self._foreign) // TURNS)
 
     @property
     def idle(self) -> bool:
-        """Whether a new job would be taken."""
+        """Whether no job is in progress."""
         return self._job is None
 
     def start(self, job: Job, clocks: list[float], slow: bool = False) -> None:
-        """Begin a sweep over all codes, once per trial clock; a ``slow`` one: those that hang here, and some others."""
+        """Start a sweep over all codes, once per trial clock.
+
+        A ``slow`` sweep covers the codes of the building's lamps, and a share of the others.
+        """
         self._fit_size(len(job.y))
         self._order = self._every
         if slow:
@@ -148,15 +154,15 @@ class Search:
         self._spectrum = _spectrum(job.y, self._size)
 
     def step(self, codes: int) -> tuple[int, Outcome | None]:
-        """Try up to ``codes`` more codes, fewer if their spectra have to be made first.
+        """Search up to ``codes`` more codes, fewer if their spectra are stale.
 
-        Returns what is left of the effort, and at the end of the sweep its outcome.
+        Returns the effort that is left, in codes, and at the end of the sweep its outcome.
         """
         job = self._job
         if job is None:
             return 0, None
         self._fit_size(len(job.y))
-        if len(self._spectrum) != self._cache.shape[1]:  # meanwhile a block of another length was followed
+        if len(self._spectrum) != self._cache.shape[1]:  # a block of another length was tracked in between
             self._spectrum = _spectrum(job.y, self._size)
         trial, first = divmod(self._next, len(self._order))
         some, cost = self._order[first : first + codes], 1
@@ -176,7 +182,7 @@ class Search:
         return self._profile.samples_per_chip / (1.0 + clock)
 
     def _prepare(self, codes: Index, clock: float) -> None:
-        """Bring what is kept of these codes up to this clock: one period of each, and its spectrum, conjugated."""
+        """Recompute stale waveforms and conjugate spectra of these codes, one code period each, for this clock."""
         stale = codes[np.abs(self._cache_clock[codes] - clock) > SAME_CLOCK]
         if not len(stale):
             return
@@ -190,19 +196,19 @@ class Search:
         self._cache_clock[stale] = clock
 
     def warm(self, n: int, clock: float) -> None:
-        """Compute all spectra for blocks of ``n`` samples at once (2 to 3 ms), so that no cycle has to."""
+        """Compute all spectra for blocks of ``n`` samples at once (2 to 3 ms), so that no cycle does it."""
         self._fit_size(n)
         self._prepare(np.arange(len(self._codes)), clock)
 
     def _correlation(self, codes: Spectrum, block: Spectrum) -> npt.NDArray[np.float32]:
-        """(K, F) correlation of a block with one period of each code that begins at each lag; valid until the next."""
+        """(K, F) correlation of a block with one period of each code, by lag of its begin; next call reuses it."""
         product, out = self._product[: len(codes)], self._lags[: len(codes)]
         np.multiply(codes, block, out=product)
         np.fft.irfft(product, self._size, out=out)  # type: ignore[arg-type]  # numpy's stubs know double only
         return out
 
     def _try(self, job: Job, clock: float, some: Index) -> list[Found]:
-        """What is found of some codes, which ascend."""
+        """Candidates among these codes (ascending) at one clock."""
         n, spc = len(job.y), self._spc(clock)
         self._prepare(some, clock)
         whole = int(some[-1]) - int(some[0]) == len(some) - 1  # then the spectra need not be copied
@@ -230,9 +236,9 @@ class Search:
         return found
 
     def common_lag(self, y: Array, clock: float, lamps: Lamps, window: float) -> float:
-        """Lag in chips by which all lamps together are behind their predicted phases, within ``window`` chips.
+        """Common delay (chips) of all lamps relative to their predicted phases, within ``window`` chips.
 
-        Each code's correlation is worked out where its periods should begin, on a grid of half samples.
+        Each code is correlated near the expected begin of its periods, on a grid of half samples.
         """
         codes, phase, amplitude = lamps
         spc, n = self._spc(clock), len(y)
@@ -249,7 +255,7 @@ class Search:
         return float(0.5 * (best - half) + min(max(fine, -0.25), 0.25)) / spc
 
     def _fit_size(self, n: int) -> None:
-        """FFT length for blocks of ``n`` samples; another length empties the kept spectra."""
+        """Set the FFT length for blocks of ``n`` samples; another length clears the stored spectra."""
         longest = int((self._profile.length + 1) * self._spc(-self._profile.clock_ppm * 1e-6) * 1.01) + 1
         size = _fast_length(n + longest)
         if self._cache.shape[1] != size // 2 + 1:
@@ -262,7 +268,7 @@ class Search:
         self._size = size
 
     def refine(self, job: Job, clock: float, found: Found) -> float:
-        """The clock by one candidate, by trial around it: 11 rates x 5 lags."""
+        """Sample clock (relative error) from one candidate, by a local grid search: 11 rates x 5 delays."""
         spc, n = self._spc(clock), len(job.y)
         rate, shift = np.meshgrid(1.0 - FINE_RATES, FINE_LAGS / spc)
         phase, rate = found.phase + shift.ravel(), rate.ravel()
@@ -278,9 +284,9 @@ class Search:
         return (1.0 + clock) * float(rate[best]) - 1.0
 
     def peeled(self, job: Job, found: list[Found]) -> Job:
-        """The same block without what has just been found in it, for another look at what that had covered.
+        """The same block after subtracting the candidates, to be searched again for lamps that they hid.
 
-        Only roughly, at the phases found.
+        The subtraction is approximate, at the phases found.
         """
         few = len(found)
         phase = np.array([f.phase for f in found])
@@ -298,17 +304,17 @@ class Search:
 
 @cache
 def _fast_length(n: int) -> int:
-    """Smallest even number of at least ``n`` without prime factors above 5, for which the FFT is quick."""
+    """Smallest even number of at least ``n`` without prime factors above 5, for a fast FFT."""
     odd: list[int] = [3**i * 5**j for i in range(11) for j in range(8)]
     return min(k << max((n - 1) // k, 1).bit_length() for k in odd if k < 2 * n)
 
 
 def _spectrum(y: Array, size: int) -> Spectrum:
-    """Half spectrum of a zero-padded block in single precision, which is quick and good enough to find peaks."""
+    """Half spectrum of a zero-padded block in single precision, which is fast and sufficient to find peaks."""
     return np.fft.rfft(y.astype(np.float32), size).astype(np.complex64, copy=False)
 
 
 def _dominant(found: list[Found]) -> list[Found]:
-    """Only those that cannot be a cross-correlation of the strongest, strongest first."""
+    """Candidates too strong to be a cross-correlation of the strongest one, strongest first."""
     found = sorted(found, key=lambda f: -f.amplitude)[:MOST_FOUND]
     return [f for f in found if f.amplitude > DOMINANCE * found[0].amplitude]

@@ -1,4 +1,4 @@
-"""Air interface and receiver front end: what transmitter and decoder must agree on (docs/air-interface.md)."""
+"""Air interface profiles and receiver front end, shared by transmitter and decoder (docs/air-interface.md)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class FrontEnd:
-    """What lies between the light and the ADC words.
+    """Analogue front end between the light and the ADC words.
 
     Attributes:
         full_scale_a: photocurrent from word 0 to word 2**bits; the coupling is AC, zero current reads half scale.
         lpf_hz: corner of the second-order Butterworth low-pass. hpf_hz: corner of the first-order AC coupling.
-        led_tau_s: time constant of the lamps' rise, taken as one for all.
+        led_tau_s: time constant of the lamps' rise, one value for all.
     """
 
     full_scale_a: float = 50e-6
@@ -35,7 +35,7 @@ class Profile:
     Attributes:
         degree: of the Gold codes, ``2**degree - 1`` chips long. chip_rate: Manchester-coded chips per second.
         depth: modulation depth of the lamps (amplitude of the modulated part over the mean).
-        sample_rate: nominal ADC rate, samples per second. epoch_s: length of the blocks it is meant for.
+        sample_rate: nominal ADC rate, samples per second. epoch_s: nominal length of a block, s.
         clock_ppm: largest error of the sample clock. crystal_ppm: largest error of a lamp's crystal.
         mains_harmonics: multiples of the mains flicker that are modelled.
     """
@@ -63,7 +63,7 @@ class Profile:
 
     @property
     def samples_per_chip(self) -> float:
-        """By the book, before any clock error."""
+        """Nominal samples per chip, without clock errors."""
         return self.sample_rate / self.chip_rate
 
 

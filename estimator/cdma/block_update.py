@@ -1,4 +1,4 @@
-"""One block for the lamps that are known: find its lag, solve it, see whether the bus stalled, bring the tracks up."""
+"""Tracks the confirmed and candidate lamps through one block: common delay, joint fit, bus stall, track update."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from estimator.cdma.sample_block import Fit, Prior, Sampled
 Index = npt.NDArray[np.int64]
 
 LEADERS: Final = 3
-"""Strongest lamps that find the lag of a block's time base."""
+"""Number of strongest lamps that determine the common delay of a block's time base."""
 
 LAG_VAR: Final = 0.05**2
-"""Chips^2: how well they find it."""
+"""Variance of that delay, chips^2."""
 
 STAMP_MARGIN_S: Final = 120e-6
-"""Lags are looked for so far beyond what the block's two stamps leave open."""
+"""Margin of the delay search beyond the uncertainty of the block's two time stamps, s."""
 
 PATIENCE: Final = 2
-"""Noisy blocks in a row from which nothing is learned; what disturbs more than those is there to stay."""
+"""Noisy blocks in a row that are not learned from; a longer disturbance is permanent."""
 
 CROSSED: Final = 0.1
 """Cross-correlation of partial code periods, rms."""
 
 QUIET: Final = 1.2
-"""Noise over its usual level that is nothing but chance."""
+"""Noise over its usual level up to which it is chance."""
 
 SPURIOUS: Final = 0.01
-"""Of the strongest lamp: below this, errors of the template's shape can look like lamps."""
+"""Share of the strongest lamp's amplitude below which errors of the pulse shape can look like lamps."""
 
 
 class Decoder:
-    """State of one photodiode's decoder; made by :func:`estimator.cdma.decoder.new_decoder`."""
+    """State of the decoder of one photodiode; created by :func:`estimator.cdma.decoder.new_decoder`."""
 
     def __init__(self, profile: Profile, clock_ppm: float | None, hung: Collection[int] = ()) -> None:
         self.profile = profile
@@ -67,13 +67,13 @@ class Decoder:
 
     @property
     def clock_ppm(self) -> float | None:
-        """Error of the sample clock, to be stored; None until a lamp has confirmed it."""
+        """Error of the sample clock, ppm, to be stored; None until a lamp has confirmed it."""
         return self.clocks.proven * 1e6 if self.clocks.known else None
 
 
 @dataclass(eq=False)
 class _Solved:
-    """A block with the prior and the lag (chips, predicted part included) that its fit started from."""
+    """A block and its fit, with the prior and the delay (chips, predicted part included) that the fit started from."""
 
     block: Sampled
     prior: Prior
@@ -82,7 +82,7 @@ class _Solved:
 
 
 def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[BlockFlag, Sampled]:
-    """Bring all tracks up to this block; returns its flags and what is left of it.
+    """Update all tracks with one block; returns its flags and the residual block.
 
     The tracks must already be predicted to the middle of the block.
     """
@@ -98,7 +98,7 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     elif not flags & BlockFlag.STALLED:
         _weigh(decoder, solved.fit)
         _read(decoder, solved)
-        if solved.fit.clearest > CLEAR:  # else all are dark, and the lag found is chance
+        if solved.fit.clearest > CLEAR:  # otherwise no lamp is received, and the delay found is chance
             clocks.update(solved.lag + solved.fit.lag - float(clocks.state[0]), excess, solved.fit)
             tracks.learn_phases(tracks.slots, solved.fit)
         _live_and_die(decoder, solved, suspicious=noisy)
@@ -108,11 +108,11 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
 
 
 def _find_lag(decoder: Decoder, sampled: Sampled, excess: float) -> float:
-    """Common lag of the block's time base, chips: where the strongest lamps correlate best together."""
+    """Common delay of the block's time base, chips: the one with the best joint correlation of the strongest lamps."""
     tracks, clocks, profile = decoder.tracks, decoder.clocks, decoder.profile
     slots, predicted = tracks.slots, float(clocks.state[0])
     lit = slots[~tracks.faint(slots)]
-    chosen = lit[np.argsort(-tracks.amplitude[lit])[:LEADERS]] if len(lit) else slots  # dark: whichever comes back
+    chosen = lit[np.argsort(-tracks.amplitude[lit])[:LEADERS]] if len(lit) else slots  # none received: all slots
     window = (STAMP_MARGIN_S + 0.5 * excess) * profile.chip_rate + 3.0 * float(np.sqrt(clocks.cov[0, 0]))
     lamps = (tracks.code[chosen], tracks.phase[chosen] + predicted, np.maximum(tracks.amplitude[chosen], 0.0))
     window = min(window, 0.4 * profile.length)
@@ -120,7 +120,7 @@ def _find_lag(decoder: Decoder, sampled: Sampled, excess: float) -> float:
 
 
 def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _Solved]:
-    """Joint fit; where it does not explain the block, the attempt to mend a stall."""
+    """Joint fit of the block; if it does not explain the block, an attempt to correct a bus stall."""
     tracks, clocks, table = decoder.tracks, decoder.clocks, decoder.shape.table
     slots, span = tracks.slots, -float(sampled.x[0])
 
@@ -136,7 +136,7 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
         return BlockFlag.NONE, solved
     newcomers = bool(np.any(tracks.life[slots] == Life.TENTATIVE))
     if newcomers and not (verdict.bent or verdict.smooth):
-        return BlockFlag.NOISY, solved  # what is left over is theirs
+        return BlockFlag.NOISY, solved  # the residual comes from the candidates
     mended = mend(sampled, fit, prior_at, table, decoder.mains, decoder.usual_noise)
     if isinstance(mended, bool):
         return BlockFlag.STALLED if mended else BlockFlag.NOISY, solved
@@ -144,7 +144,7 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
 
 
 def _listen(decoder: Decoder, fit: Fit) -> None:
-    """Follow the usual noise: a lower one soon, a rise slowly, so that single blocks do not count."""
+    """Track the usual noise: a fall quickly, a rise slowly, so that single blocks do not count."""
     noise = float(np.sqrt(fit.noise_var))
     decoder.noise = noise
     if len(decoder.tracks.confirmed):
@@ -154,7 +154,7 @@ def _listen(decoder: Decoder, fit: Fit) -> None:
 
 
 def _weigh(decoder: Decoder, fit: Fit) -> None:
-    """Amplitudes. What is left over beyond the usual may be a lamp, and codes are not orthogonal."""
+    """Store the amplitudes. Excess residual adds to their variance: it may be a lamp, and codes are not orthogonal."""
     tracks, slots = decoder.tracks, decoder.tracks.slots
     excess = max(fit.noise_var - (QUIET * decoder.usual_noise) ** 2, 0.0) if decoder.usual_noise else 0.0
     crossed = CROSSED**2 * excess / pulse_energy(decoder.profile)
@@ -163,7 +163,7 @@ def _weigh(decoder: Decoder, fit: Fit) -> None:
 
 
 def _read(decoder: Decoder, solved: _Solved) -> None:
-    """Data bits, and frames that are complete."""
+    """Accumulate the data bits, and store data frames that are complete."""
     tracks, fit, slots = decoder.tracks, solved.fit, decoder.tracks.slots
     first = tracks.first_period(slots, solved.lag, -float(solved.block.x[0]))
     tracks.rings.add(slots, first, fit.soft, fit.soft_var)
@@ -172,12 +172,13 @@ def _read(decoder: Decoder, solved: _Solved) -> None:
 
 
 def _live_and_die(decoder: Decoder, solved: _Solved, suspicious: bool) -> None:
-    """Move candidates, and in suspicious blocks all lamps, off side lobes; confirm the ripe, drop the lost.
+    """Correct side-lobe tracking, confirm candidates, and drop lost lamps.
 
-    A candidate must be stronger than the cross-correlation of a lamp that would explain all that is left over.
+    Candidates are tested for side lobes; in suspicious blocks so are all lamps. A candidate must be stronger than the
+    cross-correlation of a lamp that would explain the whole residual.
     """
     tracks, slots = decoder.tracks, decoder.tracks.slots
-    doubtful = suspicious & (solved.fit.amplitude > CLEAR * np.sqrt(solved.fit.amplitude_var))  # the dark stay put
+    doubtful = suspicious & (solved.fit.amplitude > CLEAR * np.sqrt(solved.fit.amplitude_var))  # only if received
     for k in np.flatnonzero((tracks.life[slots] == Life.TENTATIVE) | doubtful):
         beside = side_lobe(solved.block, solved.prior, solved.fit, int(k), decoder.shape.table)
         if beside:

@@ -1,7 +1,7 @@
-"""A bus that stood still inside a block: found by what it leaves over, and corrected where one pause explains it.
+"""I2C bus stall inside a block: detection from the residual, and correction of a single pause.
 
-After a pause of d seconds every lamp is d chip_rate chips ahead of the time base, all at once. One of 4 us (2 % of a
-chip) already costs 1 to 6 % of a weak lamp's amplitude, and no time stamp shows it; the strong lamps do.
+After a pause of d seconds every lamp is d chip_rate chips ahead of the time base, all at once. A pause of 4 us (2 % of
+a chip) already costs 1 to 6 % of a weak lamp's amplitude. No time stamp shows it; the strong lamps do.
 """
 
 from __future__ import annotations
@@ -24,39 +24,41 @@ PARTS: Final = 12
 """Parts of a block whose phases are compared."""
 
 BENT: Final = 4.0
-"""Energy explained by different phases per degree of freedom, over the noise; undisturbed blocks stay below 2."""
+"""Threshold of the energy explained by different phases, per degree of freedom and over the noise. Undisturbed blocks
+stay below 2.
+"""
 
 SMALLEST: Final = 0.002
 """Chips: phase differences below this do no harm (0.4 us with profile A)."""
 
 LOUD: Final = 1.5
-"""Noise over its usual level that calls for an explanation."""
+"""Noise over its usual level that requires an explanation."""
 
 SMOOTH: Final = 0.4
-"""Share of slow signal in what is left over, beyond which it is mains flicker; 0.11 for noise, less for codes."""
+"""Share of slow signal in the residual above which it is mains flicker; 0.11 for noise, less for codes."""
 
 CLEARER: Final = 1.01
-"""Correlation with two lags over that with one, beyond which a pause is believed."""
+"""Correlation with two delays over that with one, above which a pause is accepted."""
 
 SEGMENT_CHIPS: Final = 10.0
 LEADERS: Final = 4
 LONGEST_CHIPS: Final = 3.2
-"""Pauses up to 640 us with profile A are looked for."""
+"""Longest pause searched for: 640 us with profile A."""
 
 PASSES: Final = 3
-"""The mains rows bend with the pause, so its length is found in passes: 1 us of it is 10 nA of 100 Hz flicker."""
+"""Passes to find the length of a pause. The mains rows change with it: 1 us of it is 10 nA of 100 Hz flicker."""
 
 MARGIN: Final = 12
-"""Samples left out on both sides of a small pause, whose place is known to a few samples."""
+"""Samples masked on both sides of a small pause, whose position is uncertain by a few samples."""
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """How well a fit explains its block.
+    """Quality of a fit to its block.
 
     Attributes:
-        bent: phases differ over the block. loud: far more is left over than usual. smooth: and it is mains flicker that
-            is left, which a pause has torn, not the light of a lamp that is not known yet.
+        bent: phases differ over the block. loud: the residual is far larger than usual.
+        smooth: and the residual is mains flicker, which a pause has torn, not the light of an untracked lamp.
     """
 
     bent: bool
@@ -65,13 +67,13 @@ class Verdict:
 
     @property
     def good(self) -> bool:
-        """Nothing to be explained."""
+        """Whether the fit explains the block."""
         return not (self.bent or self.loud)
 
 
 @dataclass(frozen=True, eq=False)
 class Mended:
-    """A block with its time base bent, and the fit to it; ``lag``: of its prior beyond the first one, chips."""
+    """A block with a corrected time base, and its fit; ``lag``: delay of its prior beyond the first one, chips."""
 
     block: Sampled
     prior: Prior
@@ -80,7 +82,7 @@ class Mended:
 
 
 def judge(block: Sampled, fit: Fit, usual_noise: float) -> Verdict:
-    """Compare the phases of parts of the block, and what is left over with the usual (ADC steps; 0 if not known)."""
+    """Compare the phases of parts of the block, and the residual with the usual noise (ADC steps; 0 if unknown)."""
     edges = _edges(len(block.y))
     slope = fit.mixed_slope
     energy = np.maximum(np.add.reduceat(slope * slope, edges), 1e-12)
@@ -100,26 +102,27 @@ def _edges(size: int) -> npt.NDArray[np.int64]:
 
 
 def _slow_energy(row: Array) -> float:
+    """Energy of the part of a row that is slower than the codes."""
     slow = _two_chips(row)
     return float(np.einsum("i,i->", slow, slow))
 
 
 def _two_chips(row: Array) -> Array:
-    """Mean over nine samples, two chips of any profile: what is slower than codes."""
+    """Mean over nine samples, two chips of any profile: the signal slower than the codes."""
     return np.convolve(row, np.full(9, 1.0 / 9.0), "same")
 
 
 def mend(
     block: Sampled, fit: Fit, prior_at: Callable[[float], Prior], table: Array, mains: Mains, usual_noise: float
 ) -> Mended | bool:
-    """Try to explain a block by one pause; if that fails, whether there is evidence of a pause all the same.
+    """Try to explain a block by one pause. If that fails, return whether there is evidence of a pause.
 
     Args:
         block: as it was solved.
-        fit: what came of that.
-        prior_at: prediction of the tracks for a common lag beyond the one `fit` started from, chips.
+        fit: the fit to it.
+        prior_at: prediction of the tracks for a common delay beyond the one `fit` started from, chips.
         table: pulse table.
-        mains: for rows that follow a bent time base.
+        mains: for the mains rows of a corrected time base.
         usual_noise: ADC steps, to judge the result by.
     """
     verdict = judge(block, fit, usual_noise)
@@ -147,17 +150,17 @@ def mend(
 
 
 _Pause = tuple[int, int, int, float, float]
-"""First and last sample left out, first sample behind the pause, chips it lasted, chips by which the front was off."""
+"""Masked samples (first, end), first sample after the pause, its length (chips), delay of the front part (chips)."""
 
 
 def _large_pause(block: Sampled, fit: Fit, prior: Prior, table: Array) -> _Pause | None:
-    """Two different lags before and behind a place: correlate the strongest lamps at whole-sample lags."""
+    """Find a pause by two delays, before and after it, correlating the strongest lamps at whole-sample lags."""
     chosen = np.argsort(-fit.amplitude)[:LEADERS]
     n, spacing = len(block.x), float(block.x[1] - block.x[0])
     waves, ones = np.empty((2, len(chosen), n)), np.ones((len(chosen), fit.soft.shape[1]))
     lamps = np.ascontiguousarray(prior.lamps(fit.phase)[:, chosen])
     columns(prior.chips[chosen], lamps, block.samples, ones, table, waves)
-    y = (block.y - _two_chips(block.y)) * block.mask  # without what mains flicker does at the pause
+    y = (block.y - _two_chips(block.y)) * block.mask  # without the step of the mains flicker at the pause
     segment = max(int(SEGMENT_CHIPS / spacing), 4)
     edges = np.arange(0, n - segment // 2, segment)
     reach = int(np.ceil(LONGEST_CHIPS / spacing))
@@ -180,7 +183,7 @@ def _large_pause(block: Sampled, fit: Fit, prior: Prior, table: Array) -> _Pause
 
 
 def _small_pause(block: Sampled, fit: Fit, prior: Prior, table: Array) -> _Pause | None:
-    """Where a step of phase explains most of what is left over."""
+    """Find the position at which a phase step explains most of the residual."""
     del prior, table
     n = len(block.y)
     overlap = np.cumsum(fit.mixed_slope * fit.residual)

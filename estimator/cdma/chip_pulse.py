@@ -1,7 +1,7 @@
-"""The pulse of one Manchester chip after lamp, low-pass and AC coupling, tabulated for the kernels.
+"""Pulse of one Manchester chip after LED, low-pass and AC coupling, tabulated for the kernels.
 
-The low-pass is made of parts with tolerances: 10 % of its corner would leave 4 % of a strong lamp's light unexplained,
-which is as much as a weak lamp has. `Shape` learns the corner from what is left over.
+The low-pass has component tolerances. An error of 10 % of its corner would leave 4 % of a strong lamp's light
+unexplained. A weak lamp has no more. `Shape` estimates the corner from the residual.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from estimator.cdma.sample_block import Fit, Prior, Sampled
 from estimator.numerics.arrays import Array
 
 STEPS: Final = 512
-"""Table points per chip; expansion around the nearest is good to 5e-5 of the pulse, to 4e-4 where it bends."""
+"""Table points per chip; expansion around the nearest is good to 5e-5 of the pulse, to 4e-4 at its corners."""
 
 REACH: Final = 0.25
-"""Largest relative error of the low-pass corner that is believed."""
+"""Largest relative error of the low-pass corner that is accepted."""
 
 GAIN: Final = 0.7
-"""Share of an error that is followed."""
+"""Share of an error that is corrected at a time."""
 
 SOON, LATER = 2, 16
-"""Blocks between two looks at the shape, while it is wrong and when it has been found right."""
+"""Blocks between two updates of the shape: `SOON` while it is wrong, this when it is right."""
 
 WORTH: Final = 5e-4
-"""Relative corner error that is worth a new table."""
+"""Relative corner error that justifies a new table."""
 
 
 def pulse_table(profile: Profile, corner: float = 1.0) -> Array:
     """Rows at k / STEPS chips: pulse in its own chip, in the next one, and the slopes of both per chip; (STEPS + 1, 4).
 
-    Gain is 1 for a current that lies between the two corners: an amplitude is that of the photocurrent. What the pulse
-    does later than one chip after its end is 1e-3 of it (the coupling's droop) and is left out.
+    Gain is 1 for a current that lies between the two corners: an amplitude is that of the photocurrent. The pulse later
+    than one chip after its end is 1e-3 of it (the coupling's droop) and is neglected.
 
     Args:
         profile: chip rate and front end.
@@ -65,13 +65,13 @@ def pulse_table(profile: Profile, corner: float = 1.0) -> Array:
 
 @cache
 def pulse_energy(profile: Profile) -> float:
-    """Mean square of an endless code of amplitude 1, tails of neighbours taken as independent."""
+    """Mean square of an endless code of amplitude 1; the tails of neighbours are taken as independent."""
     table = pulse_table(profile)
     return float(np.mean(table[:-1, 0] ** 2 + table[:-1, 1] ** 2))
 
 
 class Shape:
-    """The table in use, and what is known of the low-pass corner."""
+    """Pulse table in use, and the estimate of the low-pass corner."""
 
     def __init__(self, profile: Profile) -> None:
         self._profile = profile
@@ -80,13 +80,14 @@ class Shape:
         self._make()
 
     def _make(self) -> None:
+        """Compute the table and its derivative by the corner."""
         self._built = self.corner
         self.table = pulse_table(self._profile, self.corner)
         more, less = (pulse_table(self._profile, self.corner * factor) for factor in (1.01, 0.99))
         self._derivative = (more - less) / 0.02
 
     def learn(self, block: Sampled, prior: Prior, fit: Fit) -> None:
-        """Every few blocks, compare what is left over with how the signal changes with the corner."""
+        """Correct the corner every few blocks: correlate the residual with the signal's derivative by it."""
         self._wait -= 1
         if self._wait:
             return
@@ -98,18 +99,18 @@ class Shape:
         change = mixed(fit.amplitude, waves[0])
         columns(prior.chips, lamps, block.samples, fit.signs, self.table, waves)
         seen = change = block.project(change)
-        for wave in np.einsum("i,kij->kj", fit.amplitude, waves):  # amplitude and delay have been solved for
+        for wave in np.einsum("i,kij->kj", fit.amplitude, waves):  # the joint fit has solved for amplitude and delay
             row = block.project(wave)
             change = change - row * float(np.dot(change, row) / max(np.dot(row, row), 1e-12))
         energy = float(np.dot(change, change))
         if energy < 1e-3 * float(np.dot(seen, seen)) or energy < 100.0 * fit.noise_var:
-            return  # too faint to tell
+            return  # too faint
         error = float(np.dot(change, fit.residual)) / energy
         self.corner = float(np.clip(self.corner * (1.0 + GAIN * error), 1.0 - REACH, 1.0 + REACH))
         if abs(error) > 4.0 * WORTH:
             self._wait = SOON
 
     def renew(self) -> None:
-        """Make the table anew where the corner is another by now: half a millisecond, not to be added to a block's."""
+        """Recompute the table if the corner has changed: half a millisecond, so not within a block update."""
         if abs(self.corner - self._built) > WORTH:
             self._make()

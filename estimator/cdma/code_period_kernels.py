@@ -1,6 +1,6 @@
-"""Kernels that take a block apart: a row for each lamp in each code period touched, and how much of it was received.
+"""Kernels that split a block by code period: one row per lamp and code period, its amplitude and its data sign.
 
-In one kernel each for the same reason as in :mod:`estimator.cdma.joint_fit_kernels`.
+Each step is one kernel for the same reason as in :mod:`estimator.cdma.joint_fit_kernels`.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ F8 = npt.NDArray[np.float64]
 I8 = npt.NDArray[np.int64]
 
 TAIL_CHIPS = 2.0
-"""By which a period outlasts itself: the tail of its last chip, with room for corrections."""
+"""Length (chips) by which a period outlasts itself: the tail of its last chip, with room for corrections."""
 
 SURE = 4.0
-"""A data sign is certain when it is so many standard deviations clear."""
+"""Standard deviations from zero beyond which a data sign is certain."""
 
 ALIKE = 0.1
-"""Relative change of a lamp's strength within a block that surprises nobody."""
+"""Usual relative change of a lamp's amplitude within a block."""
 
 
 @kernel("i8(f8[:,::1], f8[:,::1], f8[:,::1], i8, i8[:,::1], i8[:,::1])")
 def lay_out(chips: F8, lamps: F8, samples: F8, tail: int, bounds: I8, index: I8) -> int:
-    """Which code periods of each lamp a block touches, in order of time; returns how many.
+    """List the code periods of each lamp that a block touches, in order of time; returns their number.
 
     Args:
         chips: (L, C) chips of each lamp's code.
         lamps: (2, L) phase in chips at time 0, counted from the begin of the first period, and rate.
-        samples: (2, N) times, non-decreasing; not used otherwise.
+        samples: times in row 0, non-decreasing; other rows are not used.
         tail: samples by which a period outlasts itself.
         bounds: (L, P + 1) out: index of the first sample of each period; N behind the last.
         index: (4, L * P) out: lamp, period, first sample and the one behind the last of each piece.
@@ -50,7 +50,7 @@ def lay_out(chips: F8, lamps: F8, samples: F8, tail: int, bounds: I8, index: I8)
     count = 0
     for p in range(periods):
         for i in range(n_lamps):
-            if p == 0 or bounds[i, p + 1] > bounds[i, p]:  # the first one by its tail, if by nothing else
+            if p == 0 or bounds[i, p + 1] > bounds[i, p]:  # at least the tail of the first period is in the block
                 index[0, count], index[1, count] = i, p
                 index[2, count], index[3, count] = bounds[i, p], min(bounds[i, p + 1] + tail, size)
                 count += 1
@@ -59,14 +59,14 @@ def lay_out(chips: F8, lamps: F8, samples: F8, tail: int, bounds: I8, index: I8)
 
 @kernel("void(f8[:,::1], f8[:,::1], f8[:,::1], i8[:,::1], i8, f8[:,::1], f8[::1], f8[:,::1])")
 def cut(chips: F8, lamps: F8, samples: F8, index: I8, count: int, table: F8, drive: F8, out: F8) -> None:
-    """Rows of one lamp in one code period each, with the tail that reaches beyond its end, at amplitude and sign 1.
+    """Rows of one lamp in one code period each, with the tail beyond its end, at amplitude and sign 1.
 
     Args:
         chips: (L, C), as for :func:`lay_out`.
         lamps: (2, L), likewise.
-        index: what that has written.
-        samples: (3, N) times; the weight of each sample, 1 or 0; what was received.
-        count: how many pieces there are, K.
+        samples: (3, N) times; the weight of each sample, 1 or 0; the received signal.
+        index: as written by :func:`lay_out`.
+        count: number of pieces, K.
         table: of :func:`estimator.cdma.chip_pulse.pulse_table`.
         drive: (L,) amplitude of lamps whose sign is certain from correlation alone; 0 for the others.
         out: (K + 2 or more, N) the rows; then the derivative of all driven lamps together, and that times time.
@@ -78,7 +78,7 @@ def cut(chips: F8, lamps: F8, samples: F8, index: I8, count: int, table: F8, dri
     for r in range(count):
         i, p, low, high = index[0, r], index[1, r], index[2, r], index[3, r]
         code, row, rate, phase = chips[i], out[r], lamps[1, i], lamps[0, i]
-        before = code[length - 1] if p == 0 else 0.0  # what was sent ahead of the first period is not told apart
+        before = code[length - 1] if p == 0 else 0.0  # the sign of the period before the first is not resolved
         for _ in range(p):
             phase -= length
         row[:low] = 0.0
@@ -108,14 +108,14 @@ def cut(chips: F8, lamps: F8, samples: F8, index: I8, count: int, table: F8, dri
 
 @kernel("f8(f8[:,::1], i8[:,::1], i8, i8, f8[::1], f8[::1])")
 def solve_rows(stack: F8, index: I8, count: int, mains: int, found: F8, unit_var: F8) -> float:
-    """Amplitudes of the pieces, and what the leaders' lag and clock are off by; returns the noise variance.
+    """Amplitudes of the pieces, with corrections of delay and clock of the leading lamps; returns the noise variance.
 
     Args:
         stack: (K + 2 + mains + 1, N) rows of :func:`cut`, the mains rows, and the block itself.
         index: of :func:`lay_out`.
         count: K.
         mains: rows of the mains subspace.
-        found: (K + 2,) out.
+        found: (K + 2,) out: amplitudes, delay, clock.
         unit_var: (K,) out, variance at unit noise.
     """
     size, free = stack.shape[1], count + 2
@@ -126,7 +126,7 @@ def solve_rows(stack: F8, index: I8, count: int, mains: int, found: F8, unit_var
     normal, right = np.empty((free, free)), np.empty(free)
     power = reduce_rows(stack, extent, free, normal, right)
     for r in range(count):
-        normal[r, r] += 1e-3  # a thousandth of a sample's worth: pieces of one sample
+        normal[r, r] += 1e-3  # regularises pieces of one sample
     normal[count, count] *= 1.001
     normal[count + 1, count + 1] *= 1.001
     invert(normal)
@@ -144,16 +144,18 @@ def solve_rows(stack: F8, index: I8, count: int, mains: int, found: F8, unit_var
 
 @kernel("void(i8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1], f8, f8[:,:,::1])")
 def tell_signs(index: I8, pieces: F8, bounds: I8, earlier: F8, long: float, out: F8) -> None:
-    """The sign of each lamp in each code period, where it is certain: by what the last block said, or by length.
+    """Data sign of each lamp in each code period, where it is certain.
 
-    A short piece must be both clear and as strong as the rest of its lamp: what disturbs a block's last samples must
-    not pass for a sign.
+    A sign is certain by the last block's soft bit, by the length of the piece, or by its significance.
+
+    A short piece must be both significant and as strong as the rest of its lamp. A disturbance of a block's last
+    samples must not pass for a sign.
 
     Args:
         index: of :func:`lay_out`.
         pieces: (2, K) amplitude and variance of each piece.
         bounds: of :func:`lay_out`.
-        earlier: (2, L) what the last block said about the first period: sum of soft / variance, and of 1 / variance.
+        earlier: (2, L) soft bit of the first period from the last block: sum of soft / variance, and of 1 / variance.
         long: samples from which a period gets its likelier sign in any case.
         out: (3, L, P) amplitude with its sign, 0 where not touched; its variance, inf there; the sign, 0 if uncertain.
     """
@@ -183,13 +185,13 @@ def tell_signs(index: I8, pieces: F8, bounds: I8, earlier: F8, long: float, out:
 
 @kernel("void(f8[:,::1], i8[::1], f8[::1], f8[::1], f8[::1])")
 def compare_shifts(waves: F8, bounds: I8, light: F8, residual: F8, score: F8) -> None:
-    """How well one lamp's light fits at several shifts: sum over code periods of |correlation|.
+    """Fit of one lamp at several code shifts: sum over code periods of |correlation|.
 
     Args:
-        waves: (S, N) its waveform at each shift, the first being where the fit has it; signs 1.
+        waves: (S, N) its waveform at each shift, the first being that of the fit; signs 1.
         bounds: (P + 1,) first sample of each period, by the first shift.
-        light: (P,) its amplitude with the sign of each period: what the fit has taken out.
-        residual: (N,) what that has left.
+        light: (P,) its amplitude with the sign of each period, as subtracted by the fit.
+        residual: (N,) of the fit.
         score: (S,) out.
     """
     for s in range(waves.shape[0]):

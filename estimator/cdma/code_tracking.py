@@ -1,7 +1,8 @@
-"""What is remembered of the lamps from block to block: code phases, crystal rates, strengths, life and death.
+"""Code tracking of lamps from block to block: phase and rate (the role of a DLL), RSS, life cycle, shared clocks.
 
-Each lamp has a two-state Kalman filter [phase, rate]; what is common to all (lateness of the block's time stamps, host
-clock against the lamps' crystals, sample clock) has filters of its own, so that a late time stamp moves no lamp.
+Each lamp has a two-state Kalman filter [phase, rate]. Shared quantities have filters of their own, so that a late time
+stamp shifts no lamp. These are the delay of the block's time stamps, the host clock drift relative to the crystals,
+and the sample clock.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from estimator.numerics.arrays import Array
 Index = npt.NDArray[np.int64]
 
 CAPACITY: Final = 64
-"""Lamps at once."""
+"""Most lamps at once."""
 
 NEW_PHASE: Final = 0.06
-"""Chips: how well acquisition knows a phase."""
+"""Sigma of a phase from acquisition, chips."""
 
 PHASE_WALK: Final = 2e-4
-"""Chips per root second: what the rate does not explain."""
+"""Random walk of the phase beyond the rate, chips per root second."""
 
 RATE_WALK: Final = 1e-8
 """Relative crystal rate per root second (a lamp that warms up)."""
@@ -37,35 +38,35 @@ CLOCK_WALK: Final = 3e-6
 """Relative sample clock per root second."""
 
 DRIFT_WALK: Final = 3e-8
-"""Host clock against lamps' crystals, per root second."""
+"""Host clock relative to the lamps' crystals, per root second."""
 
 STAMP_S: Final = 40e-6
-"""One sigma of a block's time base from its two stamps."""
+"""One sigma of a block's time base from its two stamps, s."""
 
 APART: Final = 1.0
-"""Chips between two lamps with the same code, below which they cannot be told apart."""
+"""Distance (chips) below which two lamps with the same code cannot be separated."""
 
 ASTRAY: Final = 0.15
-"""Chips: a phase that is not known better (after a long pause) is forgotten; to search for it anew takes 0.2 s."""
+"""Sigma (chips) above which a phase is dropped, as after a long pause; a new acquisition takes 0.2 s."""
 
 LONGEST_S: Final = 1e6
-"""No pause counts for more: nothing is known any more of any phase, and squares stay numbers."""
+"""Cap of a pause, s: no phase is known after it, and squares stay finite."""
 
 UNTRIED: Final = 1.5e-4
 """One sigma of a sample clock that is stored (good to 200 ppm) or comes from a search."""
 
 FINEST: Final = 3e-4
-"""Chips: phases are not believed better than this (shape errors of the template)."""
+"""Minimum sigma of a phase, chips (errors of the pulse shape)."""
 
 HITS, MISSES, LOST = 2, 2, 20
-"""Blocks until a candidate is a lamp; until it is dropped; until a lamp is given up."""
+"""Block counts: `HITS` until a candidate is confirmed, `MISSES` until it is dropped, this until a lamp is dropped."""
 
 FAINT, CLEAR, EVIDENT = 5.0, 8.0, 20.0
-"""Sigmas below which a lamp is not seen, and that count as seen once and as seen often enough."""
+"""Significance in sigmas: below `FAINT` a lamp is not received, `CLEAR` counts as one hit, this as enough hits."""
 
 
 class Life(IntEnum):
-    """State of a slot."""
+    """Life cycle of a slot."""
 
     FREE = 0
     TENTATIVE = 1
@@ -73,13 +74,13 @@ class Life(IntEnum):
 
 
 _FREE, _TENTATIVE, _CONFIRMED = (int(life) for life in Life)
-"""As plain numbers, for comparisons with arrays."""
+"""The values of `Life` as plain numbers, for comparisons with arrays."""
 
 
 class Clocks:
-    """What all lamps share. Lag and drift are in chips and chips per chip; clock is the sample clock's relative error.
+    """Clocks that all lamps share: delay and drift (chips, chips per chip), and the sample clock's relative error.
 
-    ``clock`` is positive when samples are farther apart than the book says.
+    ``clock`` is positive when samples are farther apart than nominal.
     """
 
     def __init__(self, profile: Profile, clock_ppm: float | None) -> None:
@@ -103,7 +104,7 @@ class Clocks:
         self.clock_var += CLOCK_WALK**2 * dt
 
     def update(self, lag: float, excess_s: float, fit: Fit) -> None:
-        """Take in the lag found beyond the prediction; ``excess_s`` is how uncertain the stamps were this time."""
+        """Update with the delay beyond the prediction, chips; ``excess_s``: uncertainty of the time stamps, s."""
         noise = (max(STAMP_S, 0.3 * excess_s) * self._chip_rate) ** 2
         gain = self.cov[:, 0] / (self.cov[0, 0] + noise)
         self.state = self.state + gain * lag
@@ -112,23 +113,23 @@ class Clocks:
         self.clock_var = max(fit.clock_var, 1e-14)
 
     def prove(self) -> None:
-        """The sample clock has been confirmed by a lamp beyond doubt."""
+        """Store the sample clock as proven, because a confirmed lamp depends on it."""
         self.known, self.guess = True, None
         self.proven, self._proven_var = self.clock, self.clock_var
 
     def suppose(self, clock: float) -> None:
-        """A search over the whole range says so; the next ones, over newer blocks, will confirm it or not."""
+        """Set the sample clock from a search over the whole range; searches of newer blocks confirm or reject it."""
         self.clock = self.guess = clock
         self.clock_var = UNTRIED**2
 
     def rest(self) -> None:
-        """No lamp left: back to the last sample clock that was proven, so that chance finds do not wear it out."""
+        """Return to the last proven sample clock when no lamp is left, so that chance finds do not shift it."""
         self.clock = self.proven if self.guess is None else self.guess
         self.clock_var = max(self._proven_var, self.clock_var)
 
 
 class Tracks:
-    """Slots of lamps. Phases are in chips at the time ``t``, without the common lag, and count periods for ever."""
+    """Slots of tracked lamps. Phases are in chips at time ``t``, without the common delay, never wrapped."""
 
     def __init__(self, profile: Profile) -> None:
         self._codes = gold_codes(profile.degree)
@@ -154,7 +155,7 @@ class Tracks:
 
     @property
     def confirmed(self) -> Index:
-        """Slots of lamps that are beyond doubt."""
+        """Slots of confirmed lamps."""
         found: Index = (self.life == _CONFIRMED).nonzero()[0]
         return found
 
@@ -174,10 +175,10 @@ class Tracks:
         return dt
 
     def add(self, code: int, phase: float, t: float, amplitude: float) -> None:
-        """A candidate, its phase at time ``t`` without the common lag; ignored if all slots are taken.
+        """Add a candidate, its phase at time ``t`` without the common delay; ignored if all slots are occupied.
 
-        A lamp that is known and seen there is left alone; one that is known but faint has been lost sight of: it is
-        put where the candidate is, and has to be confirmed anew.
+        A tracked lamp that is received at this phase is left unchanged. One that is faint has been lost: it is moved to
+        the candidate's phase, and has to be confirmed again.
         """
         free = np.flatnonzero(self.life == Life.FREE)
         chips = (self.t - t) * self._chip_rate
@@ -196,7 +197,7 @@ class Tracks:
         self.amplitude[k], self.amplitude_var[k] = amplitude, 0.0
 
     def _place(self, k: int, phase: float, t: float) -> None:
-        """Put a slot to the phase that a search has found at time ``t``."""
+        """Set a slot to the phase of a search at time ``t``."""
         chips = (self.t - t) * self._chip_rate
         self.phase[k], self.rate[k] = phase + chips, 0.0
         var = self._crystal**2
@@ -206,37 +207,37 @@ class Tracks:
         self.rings.forget(k)
 
     def faint(self, slots: Index) -> npt.NDArray[np.bool_]:
-        """Which of these lamps were not seen in the last block."""
+        """Which of these lamps were not received in the last block."""
         dark: npt.NDArray[np.bool_] = self._dark[slots]
         return dark
 
     def weigh(self, slots: Index, amplitude: Array, variance: Array) -> None:
-        """Amplitudes of a block. A lamp that was dark must be clearly seen: chance reaches 5 sigmas once in a while."""
+        """Store the amplitudes of a block. A faint lamp needs more to return: chance reaches 5 sigmas now and then."""
         self.amplitude[slots], self.amplitude_var[slots] = amplitude, variance
         self._dark[slots] = amplitude < np.where(self._dark[slots], CLEAR, FAINT) * np.sqrt(variance)
 
     def drop(self, slot: int) -> None:
-        """Forget a lamp."""
+        """Free a slot."""
         self.life[slot] = Life.FREE
         self.frames[slot] = None
 
     def move(self, slot: int, chips: float) -> None:
-        """A candidate that sits on a side lobe goes to the peak and starts anew."""
+        """Move a candidate from a side lobe to the peak and restart its confirmation; ``chips``: shift."""
         self.phase[slot] += chips
         self.cov[slot] = [[NEW_PHASE**2, 0.0], [0.0, self._crystal**2]]
         self.hits[slot] = 0
         self.rings.forget(slot)
 
     def first_period(self, slots: Index, lag: float, span: float) -> Index:
-        """Running number of the code period heard first in a block that begins ``span`` chips before the middle.
+        """Running number of the first code period received in a block that begins ``span`` chips before the middle.
 
-        A period is still heard one chip after its end (its last chip's tail), with a data sign of its own.
+        A period lasts until one chip after its end (its last chip's tail), with a data sign of its own.
         """
         begin = self.phase[slots] + lag - (1.0 + self.rate[slots]) * span
         return np.floor((begin - 1.0) / self.length).astype(np.int64)
 
     def prior(self, slots: Index, lag: float, lag_var: float, clock_var: float, span: float) -> Prior:
-        """Prediction for a block whose middle is now."""
+        """Prediction for a block whose middle is at ``t``."""
         first = self.first_period(slots, lag, span)
         bit_sum, bit_weight = self.rings.before(slots, first)
         phase = self.phase[slots] + lag
@@ -253,7 +254,7 @@ class Tracks:
         )
 
     def learn_phases(self, slots: Index, fit: Fit) -> None:
-        """Conditional Gaussian: the fit's posterior of each phase moves phase and rate."""
+        """Update phase and rate from the fit's posterior of each phase (conditional Gaussian)."""
         before = self.cov[slots, 0, 0]
         after = np.minimum(np.maximum(fit.phase_var, FINEST**2), before)
         share = self.cov[slots, 0, 1] / before
@@ -264,7 +265,10 @@ class Tracks:
         self.cov[slots, 0, 1] = self.cov[slots, 1, 0] = share * after
 
     def judge(self, slots: Index, floor: float) -> Index:
-        """Count blocks seen and missed, drop the lost; returns candidates that have been seen often enough."""
+        """Count hits and misses and drop lost lamps; returns candidates with enough hits.
+
+        ``floor``: smallest amplitude of a hit, ADC steps.
+        """
         amplitude, sigma = self.amplitude[slots], np.sqrt(self.amplitude_var[slots])
         seen = (amplitude > CLEAR * sigma) & (amplitude > floor)
         tentative = self.life[slots] == _TENTATIVE
