@@ -1,4 +1,7 @@
-"""The loops of the light decoder that run over samples. Large arrays are the caller's."""
+"""Correlation and Gram matrix kernels of the light decoder: all loops over samples.
+
+The caller allocates the large arrays.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +19,10 @@ I8 = npt.NDArray[np.int64]
 
 @kernel("i8(f8[:], i8, f8)", inner=True)
 def first_from(x: F8, begin: int, limit: float) -> int:
-    """Index of the first of (N,) times, non-decreasing, that is ``limit`` or later, from ``begin`` on (at most N).
+    """Index of the first time at or after ``limit``, from ``begin`` on; N if there is none, or if the limit is NaN.
 
-    N: none is, or the limit is no number.
-    `np.searchsorted` would have every start that finds this kernel compiled load numba's part that asks for scipy's
-    BLAS, and scipy with it: half of what loading the decoder takes, and 16 MB.
+    ``x`` is non-decreasing, (N,). `np.searchsorted` would make every start load the part of numba that tests for
+    scipy's BLAS, and scipy with it. That is half of the loading time of the decoder, and 16 MB.
     """
     low, high = begin, x.shape[0]
     while low < high:
@@ -36,12 +38,12 @@ def first_from(x: F8, begin: int, limit: float) -> int:
 def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) -> I8:
     """Received waveform of each lamp at amplitude 1, and its derivative with respect to the code phase.
 
-    The pulse table is expanded to first order around its nearest point (5e-5 of the pulse, 4e-4 where it bends).
+    The pulse table is expanded to first order around its nearest point (5e-5 of the pulse, 4e-4 at its corners).
 
     Args:
         chips: (L, C) chips of each lamp's code.
-        lamps: (2, L) phase in chips at time 0, counted from the begin of the first period (a first sample slightly
-            before it is taken as its begin), and rate in chips per unit of time.
+        lamps: (2, L) phase and rate. The phase is in chips at time 0, counted from the begin of the first period. A
+            first sample slightly before that begin is taken as at it. The rate is in chips per unit of time.
         samples: (2, N) times, non-decreasing, and weight: 1, or 0 for a sample that is not to be used.
         signs: (L, P) data sign of each code period touched, in order (0 leaves the period out).
         table: of :func:`estimator.cdma.chip_pulse.pulse_table`.
@@ -70,7 +72,7 @@ def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) ->
             slope[lit:] = 0.0
             for n in range(lit):
                 u = phase + rate * x[n]
-                u = u if u > 0.0 else 0.0  # so that nothing, not even what is no number, points out of a table
+                u = u if u > 0.0 else 0.0  # so that no value, not even NaN, indexes beyond a table
                 u = u if u < length else float(length)
                 k = np.uint64(min(np.int32(u), np.int32(length - 1)))  # unsigned: no test for indices from the end
                 at = (u - k) * steps
@@ -99,13 +101,13 @@ def within(extent: I8, rows: tuple[int, int, int, int]) -> tuple[int, int]:
 def gram_within(rows: F8, extent: I8, free: int, out: F8) -> None:
     """Inner products of all M rows with the first ``free`` rows, in tiles of 4 x 4; ``out`` is (M, free).
 
-    Smaller tiles wait for their loads: 2 x 4 has six for eight products, this one eight for sixteen.
-    Not left to BLAS: its threads would fight with the daemon's for two cores and can take 50 times as long.
+    Smaller tiles are bound by their loads: a 2 x 4 tile has six loads for eight products, this one eight for sixteen.
+    BLAS is not used: its threads would compete with the daemon's for two cores and can take 50 times as long.
 
     Args:
         rows: (M, N).
         extent: (2, M) first sample of each row that may not be zero, and the one behind the last.
-        free: how many rows to multiply with.
+        free: number of rows to multiply with.
         out: (M, free).
     """
     last = rows.shape[0] - 1
@@ -154,7 +156,7 @@ def gram_within(rows: F8, extent: I8, free: int, out: F8) -> None:
 
 @kernel("void(f8[:,::1], i8, f8[:,::1])")
 def gram(rows: F8, free: int, out: F8) -> None:
-    """Inner products of all M rows, none of them known to be short, with the first ``free`` rows."""
+    """Inner products of all M rows with the first ``free`` rows, over all samples."""
     extent = np.zeros((2, rows.shape[0]), np.int64)
     extent[1] = rows.shape[1]
     gram_within(rows, extent, free, out)
@@ -174,7 +176,7 @@ def inner(rows: F8, row: F8) -> F8:
 
 @kernel("f8[::1](f8[::1], f8[:,::1])")
 def mixed(weights: F8, rows: F8) -> F8:
-    """(N,) sum of (M, N) rows, each times its weight."""
+    """(N,) weighted sum of (M, N) rows."""
     out = np.zeros(rows.shape[1])
     count = rows.shape[0]
     for i in range(0, count - 3, 4):
@@ -191,10 +193,10 @@ def mixed(weights: F8, rows: F8) -> F8:
 
 @kernel("void(f8[:,::1])")
 def invert(a: F8) -> None:
-    """Inverse of a symmetric positive definite matrix in its own place, by sweeping each pivot.
+    """Inverse of a symmetric positive definite matrix in place, by sweeping each pivot.
 
-    A pivot that vanishes against its original diagonal says that this unknown depends on others: its row and column
-    become zero, as if it were not there.
+    A pivot that vanishes indicates an unknown that depends on others. Its row and column become zero, as if it were
+    absent.
     """
     size = a.shape[0]
     for k in range(size):
@@ -212,19 +214,19 @@ def invert(a: F8) -> None:
 
 @kernel("void(f4[:,::1], f8[:,::1], f8, i8, f8, f4[::1], f8[:,::1])")
 def detect(correlation: F4, known: F8, guard: float, n_samples: int, period: float, sums: F4, out: F8) -> None:
-    """Best code phase of each code, data signs unknown: the largest sum of |correlation| over the periods touched.
+    """Best code phase of each code for unknown data signs: the largest sum of |correlation| over the periods touched.
 
     Args:
         correlation: (K, F) correlation of the block with one period of each code that begins at sample ``lag``;
-            negative lags are kept at ``lag + F``. Set to 0 where known lamps are.
-        known: (2, M) row of the correlation that is of a known lamp's code, -1 if none is, and the sample in
-            [0, period) at which a period of it begins.
-        guard: samples beside that in which nothing is looked for.
+            negative lags are stored at ``lag + F``. Set to 0 around tracked lamps.
+        known: (2, M) tracked lamps: row of the correlation of their code, -1 if absent; sample in [0, period) at which
+            a period begins.
+        guard: samples around that which are not searched.
         n_samples: of the block.
         period: samples per code period.
         sums: (int(period) + 3,) scratch.
-        out: (K, 5) lag of the best phase in [0, period], the sum there and at the lags before and behind it; and the
-            sum of the squares at those lags at which a whole period lies in the block.
+        out: (K, 5) lag of the best phase in [0, period]; the sum there and at the lags before and behind it; sum of
+            squares over the lags at which a whole period lies in the block.
     """
     size, lags = correlation.shape[1], sums.shape[0]
     for i in range(known.shape[1]):
@@ -262,16 +264,16 @@ def detect(correlation: F4, known: F8, guard: float, n_samples: int, period: flo
 
 @kernel("void(f4[:,::1], f4[::1], f8[:,::1], f8, f8[::1])")
 def align(waves: F4, y: F4, lamps: F8, period: float, score: F8) -> None:
-    """How well lamps together fit a common shift, in half samples from ``-(S // 2)``: sum of |correlation|.
+    """Joint fit of lamps at a common shift: sum of |correlation| for shifts in half samples, from ``-(S // 2)``.
 
-    For so few lags an FFT would be the longer way.
+    For so few lags an FFT would take longer.
 
     Args:
         waves: (L, W) one period of each lamp's code.
         y: (N,) the block.
         lamps: (2, L) sample at which a code period of each lamp should begin, within [0, period); weight.
         period: samples per code period.
-        score: (S,) for each shift towards earlier samples.
+        score: (S,) out, for each shift towards earlier samples.
     """
     n_samples, width, middle = y.shape[0], waves.shape[1], score.shape[0] // 2
     reach = middle // 2 + 1
@@ -302,16 +304,16 @@ def align(waves: F4, y: F4, lamps: F8, period: float, score: F8) -> None:
 
 @kernel("void(i8[::1], i8[::1], f8[:,::1], f8[:,::1], f8, f8[:,:,::1], i8[:,::1])")
 def fold(slots: I8, period: I8, soft: F8, variance: F8, fade: float, rings: F8, last: I8) -> None:
-    """Add soft bits to those of the same place in the frame.
+    """Add soft bits to those of the same position in the data frame.
 
     Args:
         slots: (L,) rows of the rings.
         period: (L,) running number of the first code period touched.
         soft: (L, P) amplitude times sign of each period touched.
         variance: (L, P), inf where not touched.
-        fade: weight of what an earlier repetition said.
+        fade: weight of earlier repetitions of the frame.
         rings: (2, capacity, bits) sum of soft / variance, and of 1 / variance.
-        last: (capacity, bits) running number of the period last added to each place.
+        last: (capacity, bits) running number of the period last added at each position.
     """
     bits = last.shape[1]
     for i in range(slots.shape[0]):

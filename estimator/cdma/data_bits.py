@@ -1,6 +1,6 @@
-"""The data signs of a block: amplitude of every lamp in every code period touched, solved jointly.
+"""Data signs of a block: joint solution for the amplitude of every lamp in every code period touched.
 
-One more pair of rows stands for what the leaders' lag and clock are off by; without it their errors, ten times a weak
+A further pair of rows corrects the delay and clock of the leading lamps. Without it their errors, ten times a weak
 lamp's light, would look like noise and hide its signs.
 """
 
@@ -21,19 +21,19 @@ from estimator.numerics.arrays import Array
 Index = npt.NDArray[np.int64]
 
 LEADER: Final = 0.4
-"""Lamps of at least this share of the strongest lead: their signs are certain before anything is solved."""
+"""Share of the strongest amplitude from which lamps lead: their signs are certain before the solution."""
 
 LONG_PIECE: Final = 0.25
-"""A code period of which the block holds at least this share gets its likelier sign in any case."""
+"""Share of a code period within the block from which it gets its likelier sign in any case."""
 
 
 @dataclass(eq=False)
 class Pieces:
-    """The block's signal, a row per lamp and code period touched (K), and two for lag and clock.
+    """The block's signal: one row per lamp and code period touched (K), and two rows for delay and clock.
 
     Attributes:
         index, bounds: of :func:`estimator.cdma.code_period_kernels.lay_out`. rows: (K + 2, N).
-        found: (K + 2,) amplitudes with their signs; lag in chips; relative clock.
+        found: (K + 2,) amplitudes with their signs; delay in chips; relative clock.
         unit_var: (K,) variance at unit noise. noise_var: per sample.
     """
 
@@ -47,7 +47,7 @@ class Pieces:
 
 @dataclass(eq=False)
 class Signs:
-    """Data signs (L, P), 0 where a short piece is not certain; amplitudes with sign and their variances, inf if absent.
+    """Data signs (L, P), 0 where a short piece is uncertain; signed amplitudes with their variances, inf if absent.
 
     ``lag`` and ``clock``: first corrections to the prior's. ``noise_var``: per sample.
     """
@@ -64,7 +64,7 @@ def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
     """Solve for the amplitude of each lamp in each code period touched, at the phases of the prior."""
     n_lamps, length = prior.chips.shape
     span = float(block.x[-1] - block.x[0])
-    periods = int(span / length) + 4  # a tail in front, and one spare for corrections of the clock
+    periods = int(span / length) + 4  # a tail in front, and one spare period for clock corrections
     tail = int(TAIL_CHIPS / (block.x[1] - block.x[0]))
     bounds, index = np.empty((n_lamps, periods + 1), np.int64), np.empty((4, n_lamps * periods), np.int64)
     samples, lamps = rows_of(block.x, block.mask, block.clean), prior.lamps()
@@ -78,7 +78,7 @@ def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
 
 
 def stacked(block: Sampled, free: int) -> Array:
-    """Room for ``free`` rows (not initialised) above the block's mains rows and its y."""
+    """Array with ``free`` uninitialised rows above the block's mains rows and its y."""
     stack = np.empty((free + len(block.q) + 1, len(block.y)))
     stack[free:-1] = block.q
     stack[-1] = block.y
@@ -86,13 +86,13 @@ def stacked(block: Sampled, free: int) -> Array:
 
 
 def without(block: Sampled, prior: Prior, table: Array) -> Array:
-    """What is left of a block when these lamps are taken out near these phases; (N,), mains taken out as well."""
+    """(N,) residual of a block after subtracting these lamps near these phases, and the mains."""
     pieces = solve_pieces(block, prior, table)
     return block.project(block.y - mixed(pieces.found, pieces.rows))
 
 
 def data_signs(block: Sampled, prior: Prior, table: Array) -> Signs:
-    """Data signs of a block, from this block and from what the last one said about the first period touched."""
+    """Data signs of a block, from this block and from the last block's soft bits of the first period touched."""
     pieces = solve_pieces(block, prior, table)
     whole = prior.chips.shape[1] * len(block.x) / float(block.x[-1] - block.x[0])
     found = rows_of(pieces.found[:-2], pieces.noise_var * pieces.unit_var)
@@ -105,11 +105,11 @@ def data_signs(block: Sampled, prior: Prior, table: Array) -> Signs:
 
 
 SHIFTS: Final = np.array([0.0, -0.5, 0.5, -1.0, 1.0])
-"""Chips: where a Manchester code has side lobes (-0.5 at half a chip)."""
+"""Side lobes of a Manchester code, chips (-0.5 at half a chip)."""
 
 
 def side_lobe(block: Sampled, prior: Prior, fit: Fit, lamp: int, table: Array) -> float:
-    """Chips by which one lamp of a fit sits beside its correlation peak: 0, or one of the side lobes' distances."""
+    """Distance (chips) of one lamp of a fit from its correlation peak: 0, or that of a side lobe."""
     few = len(SHIFTS)
     waves, signs, score = np.empty((2, few, len(block.x))), np.ones((few, fit.soft.shape[1])), np.empty(few)
     phase = prior.phase[lamp] + SHIFTS + fit.phase[lamp] + fit.lag

@@ -1,6 +1,7 @@
-"""The data layer: one bit per code period, sent by inverting the code, in a frame that a lamp repeats for ever.
+"""Data link: frame of lamp ID, position, height and power, with encoder, decoder and CRC.
 
-It carries the paper's coded information T = (x, y, i) with height and power. The layout is in docs/air-interface.md.
+One bit per code period, sent by inverting the code; a lamp repeats its frame for ever. The frame carries the paper's
+coded information T = (x, y, i), with height and power. The layout is in docs/air-interface.md.
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ FIELDS: Final = (
 
 PAYLOAD_BITS: Final = sum(width for _, width, _, _ in FIELDS)
 FRAME_BITS: Final = SYNC_BITS + PAYLOAD_BITS + CRC_BITS
-"""116: 2.946 s with profile A."""
+"""116 bits: 2.946 s with profile A."""
 
 
 @dataclass(frozen=True, slots=True)
 class LampFrame:
-    """What a lamp says about itself: the paper's T = (x, y, i), its height, and how it radiates.
+    """Content of a lamp's data frame: the paper's T = (x, y, i), its height, and its radiation.
 
     Attributes:
         lamp_id: its number in the building (codes are reused, this is not). x_m, y_m, z_m: in the survey's frame.
-        power_w: mean radiant power. half_angle_deg: at which intensity has halved, 0 where not told.
+        power_w: mean radiant power. half_angle_deg: angle of half intensity, 0 where not given.
     """
 
     lamp_id: int
@@ -57,12 +58,12 @@ def crc16(bits: int, width: int) -> int:
 
 
 def _checksum(payload: int, code: int) -> int:
-    """The code's number is part of what is protected, though it is not sent: a frame heard on a wrong code fails."""
+    """CRC of payload and code number. The number is not sent, but a frame received on a wrong code fails."""
     return crc16(code << PAYLOAD_BITS | payload, 16 + PAYLOAD_BITS)
 
 
 def encode(frame: LampFrame, code: int) -> int:
-    """The frame as an integer of FRAME_BITS bits, most significant bit sent first.
+    """Frame as an integer of FRAME_BITS bits, most significant bit sent first.
 
     Raises:
         ValueError: a value does not fit its field.
@@ -78,6 +79,7 @@ def encode(frame: LampFrame, code: int) -> int:
 
 
 def _payload(bits: int) -> LampFrame:
+    """Fields of a payload."""
     values: dict[str, float] = {}
     for name, width, unit, signed in reversed(FIELDS):
         value = bits & (1 << width) - 1
@@ -91,9 +93,9 @@ _SYNC_TEXT: Final = f"{SYNC:0{SYNC_BITS}b}"
 
 
 def decode_ring(ring: int, code: int) -> LampFrame | None:
-    """Find the frame in FRAME_BITS consecutive bits that begin anywhere in it; None if there is none.
+    """Decode the frame in FRAME_BITS consecutive bits that may begin anywhere in it; None if there is none.
 
-    A receiver that inverts the light (every bit flipped) is tried as well. Frames of another version are not for us.
+    Inverted bits are tried as well, for a receiver that inverts the light. Frames of another version are ignored.
     """
     whole = (1 << FRAME_BITS) - 1
     for word in (ring, ring ^ whole):

@@ -1,4 +1,4 @@
-"""The light decoder: ADC words in, lamp IDs and received strengths out.
+"""CDMA decoder: ADC sample blocks to lamp IDs and RSS.
 
 Use::
 
@@ -6,7 +6,7 @@ Use::
     epoch = decode(decoder, block)                       # once per block
     search(decoder, codes=129)                           # once per cycle, as much as the cycle can afford
 
-`decode` follows the lamps that are known; `search` looks for others in slices. Neither reads a clock.
+`decode` tracks the lamps already acquired; `search` acquires others in slices. Neither reads a clock.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from estimator.cdma.sample_block import Sampled
 from estimator.numerics.arrays import Array
 
 LONGEST: Final = 10
-"""Code periods: no block may be longer."""
+"""Longest block, in code periods."""
 
 CLIP_SHARE: Final = 0.2
-"""Of a block at the rails, beyond which what is left says nothing."""
+"""Share of clipped samples above which a block is unusable."""
 RAIL: Final = 1.0 / 128.0
 """Share of the range beside either rail that counts as the rail: amplifiers stop up to 25 mV short of 3.3 V."""
 
@@ -35,30 +35,31 @@ RATE: Final = 0.05
 """Largest relative difference between a block's nominal rate and the profile's."""
 
 NEW_CLOCK: Final = 4
-"""Blocks from the past in a row until they are taken for the present."""
+"""Blocks in a row with earlier times until they count as a new time base."""
 
 STORED_PPM: Final = 200.0
-"""A stored sample clock is good to this."""
+"""Accuracy of a stored sample clock, ppm."""
 
 REFINING, PEELING, TAKING = 80, 45, 4
-"""Codes that could be tried in the time in which a sample clock is refined, lamps are taken out of a block, one lamp
-is made a candidate."""
+"""Costs in codes that could be searched meanwhile: `REFINING` a sample clock, `PEELING` lamps off a block, and adding
+one candidate.
+"""
 
 AGAIN: Final = 2
-"""Times that a block is searched again without what was found in it."""
+"""Repeated searches of a block after subtracting the lamps found in it."""
 
 FULL_ROUND: Final = 8
 """Sweeps without a confirmed lamp until all sample clocks are tried."""
 
 
 def new_decoder(profile: Profile, clock_ppm: float | None = None, hung: Collection[int] = ()) -> Decoder:
-    """A decoder that knows no lamps yet.
+    """Decoder without any lamps yet.
 
     Args:
         profile: air interface and front end.
         clock_ppm: stored error of the sample clock, good to 200 ppm; None: search the whole range of the profile.
-        hung: codes of the lamps that hang in the building, as far as is known: where nothing speaks for further lamps,
-            these are looked for more often than others. Empty: any may hang.
+        hung: codes of the lamps in the building, as far as known; empty: any. When nothing indicates further lamps,
+            these are searched more often than others.
 
     Raises:
         ValueError: a stored clock outside the profile's range.
@@ -69,9 +70,9 @@ def new_decoder(profile: Profile, clock_ppm: float | None = None, hung: Collecti
 
 
 def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
-    """Follow all known lamps through one block and report them. Never raises, whatever is in the block.
+    """Track all known lamps through one block and return their links. Never raises, whatever the block contains.
 
-    Blocks must come in order of time; one from the past is malformed, several in a row are a new clock.
+    Blocks must be in order of time. An earlier one is malformed; several in a row are a new time base.
     """
     sampled, flags = _prepare(decoder, block)
     if sampled is not None and not _onward(decoder, block):
@@ -84,14 +85,14 @@ def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
         if flags == BlockFlag.NONE:
             decoder.mains.learn(sampled.y)
         decoder.odd = decoder.odd + 1 if flags & (BlockFlag.STALLED | BlockFlag.NOISY) else 0
-        if decoder.odd != 1:  # what one block has left over may be a stall; if the next has it too, it is a lamp
+        if decoder.odd != 1:  # the residual of one block may be a stall; if the next repeats it, it is a lamp
             _offer(decoder, residual, t_middle)
         _watch(decoder, flags)
     return _epoch(decoder, block, flags)
 
 
 def _onward(decoder: Decoder, block: SampleBlock) -> bool:
-    """Whether time goes on with this block; if it has gone back for good, the phases of all lamps are forgotten."""
+    """Whether the block is later than the last. After a permanent step back, all lamps are dropped."""
     tracks = decoder.tracks
     forward = 0.5 * (block.t_begin + block.t_end) > tracks.t
     decoder.past = 0 if forward else decoder.past + 1
@@ -104,10 +105,11 @@ def _onward(decoder: Decoder, block: SampleBlock) -> bool:
 
 
 def search(decoder: Decoder, codes: int) -> None:
-    """Look for further lamps, with as much work as it takes to try ``codes`` codes (6 us each with profile A).
+    """Search for further lamps, with the effort of ``codes`` codes (6 us each with profile A).
 
-    What else there is to do counts as so many codes, or has a call of its own. While nothing speaks for further lamps,
-    a small part of the effort is used: estimator/cdma/acquisition_budget.py.
+    Other work counts as an equivalent number of codes, or has a call of its own. While nothing indicates further lamps,
+    a
+    small part of the effort is used: estimator/cdma/acquisition_budget.py.
     """
     decoder.shape.renew()
     allowed = decoder.watch.allow(codes)
@@ -115,7 +117,7 @@ def search(decoder: Decoder, codes: int) -> None:
 
 
 def _search(decoder: Decoder, codes: int) -> int:
-    """Returns what is left of the effort; what was begun is brought to an end, so it may be less than nothing."""
+    """Spend the effort on searching; returns the rest, negative if the last step exceeded it."""
     while codes > 0:
         if decoder.found is not None:
             found, decoder.found = decoder.found, None
@@ -128,7 +130,7 @@ def _search(decoder: Decoder, codes: int) -> int:
 
 
 def _begin(decoder: Decoder) -> bool:
-    """Start to search the block last offered, if there is one."""
+    """Start to search the last offered block, if there is one."""
     clocks = _trial_clocks(decoder) if decoder.offered else []
     if decoder.offered is None:
         return False
@@ -139,7 +141,7 @@ def _begin(decoder: Decoder) -> bool:
 
 
 def _sweep(decoder: Decoder, codes: int) -> int:
-    """Go on with the sweep; returns what is left of the effort."""
+    """Continue the sweep; returns the rest of the effort."""
     left, done = decoder.search.step(codes)
     if done is not None:
         decoder.barren += 1
@@ -149,12 +151,15 @@ def _sweep(decoder: Decoder, codes: int) -> int:
 
 
 def _trial_clocks(decoder: Decoder) -> list[float]:
-    """The known clock alone; all of the range while none is known, and again when the known one confirms no lamp."""
+    """Clocks to try: the known one alone, or the whole range.
+
+    The range is used while none is known, and again when the known one confirms no lamp.
+    """
     tracks, clocks = decoder.tracks, decoder.clocks
     if (clocks.known or clocks.guess is not None or len(tracks.slots)) and decoder.barren < FULL_ROUND:
         return [clocks.clock]
     clocks.guess = None
-    if len(tracks.slots):  # candidates that came to nothing: start from a block without them
+    if len(tracks.slots):  # candidates that were not confirmed: start from a block without them
         for slot in tracks.slots:
             tracks.drop(int(slot))
         decoder.offered = None
@@ -163,13 +168,16 @@ def _trial_clocks(decoder: Decoder) -> list[float]:
 
 
 def _take(decoder: Decoder, job: Job, clock: float, found: list[Found]) -> int:
-    """Make candidates of what a sweep found; the first ever tell the sample clock only. Returns its cost in codes."""
+    """Add the candidates of a sweep to the tracks; the first ever only set the sample clock. Returns the cost.
+
+    The cost is in codes.
+    """
     tracks, clocks, cost = decoder.tracks, decoder.clocks, TAKING * len(found)
     settled = clocks.known or clocks.guess is not None
     if not len(tracks.slots) and (clock != clocks.clock or not settled):
         clocks.suppose(decoder.search.refine(job, clock, found[0]))
-        return REFINING  # a sweep over all clocks takes so long that the phases in its block are no longer true
-    decoder.offered = None  # in a block from before, these lamps have not been taken out
+        return REFINING  # a sweep over all clocks takes so long that the phases of its block are out of date
+    decoder.offered = None  # these lamps are not subtracted from an earlier block
     for candidate in found:
         tracks.add(candidate.code, candidate.phase - job.lag, job.t_middle, candidate.amplitude)
     if job.again < AGAIN:
@@ -179,7 +187,10 @@ def _take(decoder: Decoder, job: Job, clock: float, found: list[Found]) -> int:
 
 
 def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, BlockFlag]:
-    """Words to ADC steps about mid-scale, on the clock's time axis, with what must be left out."""
+    """Check a block and convert it to ADC steps about mid-scale, on the sample clock's time axis.
+
+    Clipped samples are masked. Returns None for an unusable block, and its flags.
+    """
     profile = decoder.profile
     words = np.asarray(block.words, np.float64)
     n, top = len(words), 2.0**profile.front_end.bits - 1.0
@@ -210,7 +221,7 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
 
 
 def _watch(decoder: Decoder, flags: BlockFlag) -> None:
-    """Let the watch know what this block says for or against further lamps."""
+    """Update the acquisition budget with this block."""
     tracks = decoder.tracks
     lit = tracks.confirmed
     odd = flags not in (BlockFlag.NONE, BlockFlag.CLIPPED) or len(lit) < len(tracks.slots)
@@ -219,7 +230,7 @@ def _watch(decoder: Decoder, flags: BlockFlag) -> None:
 
 
 def _offer(decoder: Decoder, residual: Sampled, t_middle: float) -> None:
-    """Leave the block, without the lamps that are seen, to be searched."""
+    """Offer the block, with the received lamps subtracted, to the search."""
     tracks, lag = decoder.tracks, float(decoder.clocks.state[0])
     slots = tracks.slots
     slots = slots[~tracks.faint(slots)]
@@ -228,7 +239,7 @@ def _offer(decoder: Decoder, residual: Sampled, t_middle: float) -> None:
 
 
 def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch:
-    """Report the confirmed lamps, none if the block is of no use."""
+    """Links of the confirmed lamps; none if the block is unusable."""
     tracks, lsb = decoder.tracks, decoder.profile.front_end.lsb_a
     links = tracks.confirmed if not flags & UNUSABLE else np.empty(0, np.int64)
     code, amplitude, variance = tracks.code[links], tracks.amplitude[links], tracks.amplitude_var[links]

@@ -1,4 +1,4 @@
-"""What goes into the light decoder and what comes out of it."""
+"""Input and output of the light decoder: sample block, and light epoch with its links and flags."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ Index = npt.NDArray[np.int64]
 
 
 class BlockFlag(IntFlag):
-    """What was wrong with a block; several may be."""
+    """Defects of a block; several may be set."""
 
     NONE = 0
     CLIPPED = 1  # some samples at the rails; they were left out
     SATURATED = 2  # too many at the rails: no amplitudes
     FLAT = 4  # no variation at all: dark and unlit, or a dead converter
-    MALFORMED = 8  # words, a rate or times that cannot be
-    LENGTH = 16  # shorter than a code period, or longer than can be afforded
-    STALLED = 32  # the bus stood still inside; amplitudes are not to be used
-    MENDED = 64  # the bus stood still inside, and that was corrected
-    NOISY = 128  # far more left over than usual: something in the light is not explained
+    MALFORMED = 8  # impossible words, rate or times
+    LENGTH = 16  # shorter than a code period, or too long to process
+    STALLED = 32  # a bus stall inside; amplitudes are not to be used
+    MENDED = 64  # a bus stall inside, corrected
+    NOISY = 128  # residual far above usual: part of the light is not explained
 
 
 UNUSABLE = BlockFlag.SATURATED | BlockFlag.FLAT | BlockFlag.MALFORMED | BlockFlag.LENGTH | BlockFlag.STALLED
 
 
 class LinkFlag(IntFlag):
-    """What is special about one link."""
+    """Properties of one link."""
 
     NONE = 0
-    FAINT = 1  # amplitude not significant (occluded, or out of view); the phase is being remembered
-    TWIN = 2  # another lamp with the same code is in view: the ID alone does not tell which
+    FAINT = 1  # amplitude not significant (occluded, or out of view); the phase is kept
+    TWIN = 2  # another lamp with the same code is in view: the ID alone is ambiguous
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,12 +56,12 @@ class SampleBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightEpoch:
-    """Which lamps were seen over ``[t_begin, t_end]`` and how strongly; arrays have one element per link.
+    """Lamps received over ``[t_begin, t_end]`` and their RSS; arrays have one element per link.
 
     Attributes:
-        ids: code numbers; an ID may occur twice (see `LinkFlag.TWIN`). amplitude: A, amplitude of the modulated
-            photocurrent. variance: A^2. flags: of :class:`LinkFlag`.
-        lamps: what each lamp has said about itself, None until its first frame is complete.
+        ids: code numbers; an ID may occur twice (see `LinkFlag.TWIN`).
+        amplitude: RSS, A, amplitude of the modulated photocurrent. variance: A^2. flags: of :class:`LinkFlag`.
+        lamps: data frame of each lamp, None until its first frame is complete.
         block: of :class:`BlockFlag`; without a usable block there are no links. noise_a: A per sample.
         clock_ppm: error of the sample clock, None until it is known.
     """

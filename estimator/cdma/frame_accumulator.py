@@ -1,4 +1,4 @@
-"""Soft data bits of the lamps that are followed, gathered over repetitions of their frames until they can be read."""
+"""Soft-bit accumulator: sums the data bits of tracked lamps over repetitions of their frames until they decode."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from estimator.numerics.arrays import Array
 Index = npt.NDArray[np.int64]
 
 KNOWN: Final = 3.0
-"""A bit counts as received when its sign is so many standard deviations clear; the CRC finds up to three wrong ones."""
+"""Standard deviations from zero beyond which a bit counts as received; the CRC detects up to three wrong bits."""
 
 FADE: Final = 0.7
-"""Weight of what the repetition before said of the same bit: a lamp that is told something new is believed in 9 s."""
+"""Weight of the previous repetition of a bit: a lamp with a changed frame is decoded in 9 s."""
 
 RETRY: Final = 29
 """New bits before another attempt at a frame that failed its check: a quarter of it."""
@@ -33,7 +33,7 @@ class BitRings:
 
     @property
     def _sum(self) -> Array:
-        view: Array = self._rings[0]  # no attribute: a view that is kept and pickled becomes an array of its own
+        view: Array = self._rings[0]  # not stored: a pickled view would become an array of its own
         return view
 
     @property
@@ -42,11 +42,11 @@ class BitRings:
         return view
 
     def forget(self, slot: int) -> None:
-        """Start anew in a slot that another lamp takes."""
+        """Clear a slot for another lamp."""
         self._sum[slot], self._weight[slot], self._last[slot], self._due[slot] = 0.0, 0.0, -1, 0
 
     def add(self, slots: Index, period: Index, soft: Array, variance: Array) -> None:
-        """Take in what one block says.
+        """Add the soft bits of one block.
 
         Args:
             slots: (L,).
@@ -57,15 +57,15 @@ class BitRings:
         fold(slots, period, soft, variance, FADE, self._rings, self._last)
 
     def before(self, slots: Index, period: Index) -> tuple[Array, Array]:
-        """Sum and weight gathered so far for one running period of each lamp; 0 if it is new. Both (L,)."""
+        """Sum and weight so far of one running period of each lamp, both (L,); 0 if the period is new."""
         at = period % FRAME_BITS
         same = self._last[slots, at] == period
         return np.where(same, self._sum[slots, at], 0.0), np.where(same, self._weight[slots, at], 0.0)
 
     def frames(self, slots: Index, codes: Index, period: Index) -> list[tuple[int, LampFrame]]:
-        """Read the frames of those lamps of which every bit is known; slots with what was read.
+        """Decode the frames of the lamps whose bits are all received; returns (slot, frame).
 
-        ``period`` is each lamp's running number now, which paces the attempts; all (L,).
+        ``period`` is each lamp's current running number, which spaces the attempts; all arrays (L,).
         """
         due = (period >= self._due[slots]).nonzero()[0]
         if not len(due):

@@ -1,7 +1,7 @@
-"""Gold codes: the spreading codes by which ceiling lamps are told apart (R. Gold, IEEE Trans. Inf. Theory 13, 1967).
+"""Gold codes: spreading codes that distinguish the ceiling lamps (R. Gold, IEEE Trans. Inf. Theory 13, 1967).
 
-A preferred pair of m-sequences u, v of length L = 2^n - 1 gives L + 2 codes: number k < L is u + T^k v (v shifted left
-by k, sum modulo 2), number L is u, number L + 1 is v. Off-peak correlations take three values only, the largest
+A preferred pair of m-sequences u, v of length L = 2^n - 1 gives L + 2 codes. Number k < L is u + T^k v (v shifted left
+by k, sum modulo 2). Number L is u, number L + 1 is v. Off-peak correlations take three values only. The largest is
 t(n) / L with t = 2^((n+1)/2) + 1 for odd n and 2^((n+2)/2) + 1 for even n: 0.27 (n = 6), 0.134 (7), 0.065 (9).
 """
 
@@ -47,7 +47,7 @@ def gold_codes(degree: int) -> Chips:
     """All codes of one degree as chips, shape (2**degree + 1, 2**degree - 1); bit 0 is +1, bit 1 is -1.
 
     Raises:
-        ValueError: no preferred pair is kept for that degree.
+        ValueError: no preferred pair is defined for that degree.
     """
     if degree not in PREFERRED:
         raise ValueError(f"no Gold codes of degree {degree}; degrees {sorted(PREFERRED)} exist")

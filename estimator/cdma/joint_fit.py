@@ -1,8 +1,8 @@
-"""Joint least squares of one block: all lamps in view, their code phases, the common clock, offset and mains at once.
+"""Joint least squares of one block: all lamps in view, their code phases, common clock, offset and mains at once.
 
-Unknown are [amplitude of each lamp | code phase of each lamp | common lag | common clock | stalls]; the rows of the
-mains subspace are eliminated beforehand. Phases have priors from the tracks, so that a weak lamp keeps its predicted
-phase while a strong one corrects it. Amplitude and phase are bilinear: a few Gauss-Newton steps.
+The unknowns are [amplitude of each lamp | code phase of each lamp | common delay | common clock | stalls]. The rows of
+the mains subspace are eliminated beforehand. Phases have priors from the tracks: a weak lamp keeps its predicted phase
+while a strong one corrects it. Amplitude and phase are bilinear: a few Gauss-Newton steps suffice.
 """
 
 from __future__ import annotations
@@ -35,13 +35,14 @@ from estimator.cdma.sample_block import Fit, Prior, Sampled
 from estimator.numerics.arrays import Array
 
 MAX_STEPS: Final = 6
+"""Most Gauss-Newton steps."""
 
 
 def joint_fit(block: Sampled, prior: Prior, table: Array) -> Fit:
-    """Solve one block for all lamps of ``prior`` (at least one): Gauss-Newton until the steps are small.
+    """Fit all lamps of ``prior`` (at least one) to one block: Gauss-Newton until the steps are small.
 
-    ``stack`` holds the columns of the system as rows: values (L), slopes (L), clock, stalls, and one for each code
-    period whose sign is not certain, with an amplitude of its own; then the mains rows and the block itself.
+    ``stack`` holds the columns of the system as rows: values (L), slopes (L), clock, stalls. One row follows for each
+    code period of uncertain sign, with an amplitude of its own; then the mains rows and the block.
     """
     first = data_signs(block, prior, table)
     lamps, common = _start(block, prior, first)
@@ -78,7 +79,7 @@ def joint_fit(block: Sampled, prior: Prior, table: Array) -> Fit:
 
 
 def _start(block: Sampled, prior: Prior, first: Signs) -> tuple[Array, Array]:
-    """The unknowns before the first step, as the kernels want them: of the lamps, and what is common to them."""
+    """Initial unknowns in the layout of the kernels: those of the lamps, and those common to them."""
     weight = 1.0 / first.soft_var
     lamps = np.zeros((LAMP_ROWS, len(prior.phase)))
     lamps[PHASE], lamps[RATE], lamps[PRECISION] = prior.phase, prior.rate, 1.0 / prior.phase_var

@@ -1,7 +1,7 @@
-"""Kernels of the joint fit: normal equations without the mains, and Gauss-Newton on one block from end to end.
+"""Gauss-Newton kernels of the joint fit: normal equations with the mains eliminated, step, residual.
 
-In one kernel each, because a block takes a few hundred steps over arrays so small that calling numpy for each of them
-costs more than all the arithmetic.
+Each step is one kernel. A block takes a few hundred operations on small arrays. Calling numpy for each of them costs
+more than all the arithmetic.
 """
 
 from __future__ import annotations
@@ -19,22 +19,26 @@ I8 = npt.NDArray[np.int64]
 
 LAMP_ROWS = 7
 PHASE, RATE, PRECISION, AMPLITUDE, MOVED, AMPLITUDE_VAR, MOVED_VAR = range(LAMP_ROWS)
-"""Rows of ``lamps``: the prior's phase, rate and inverse phase variance; amplitude; correction of the phase; variances
-of these two."""
+"""Rows of ``lamps``: phase, rate and inverse phase variance of the prior; amplitude; phase correction; variances of the
+last two.
+"""
 COMMON_ROWS = 4
 VALUE, COMMON_PRECISION, COMMON_VAR, AT = range(COMMON_ROWS)
-"""Rows of ``common``, whose columns are lag, clock and the pauses: correction, inverse prior variance, variance, and
-the sample before which the bus stood still."""
+"""Rows of ``common``, whose columns are delay, clock and the pauses: correction, inverse prior variance, variance, and
+the sample at which the pause ends.
+"""
 
 SETTLED = 0.006
-"""Chips: a last step below this is corrected for to second order and leaves less than 1e-4 of the amplitude."""
+"""Chips: a last step below this is corrected to second order, with an error below 1e-4 of the amplitude."""
 REACH = 0.12
-"""Chips: the derivative columns are trusted so far."""
+"""Range of validity of the derivative columns, chips."""
 
 
 @kernel("f8(f8[:,::1], i8[:,::1], i8, f8[:,::1], f8[::1])", inner=True)
 def reduce_rows(stack: F8, extent: I8, free: int, matrix: F8, right: F8) -> float:
-    """Normal matrix and right side of the first ``free`` rows with the mains rows eliminated; power of y likewise.
+    """Normal matrix and right side of the first ``free`` rows, with the mains rows eliminated.
+
+    Returns the power of y, likewise without the mains.
 
     Args:
         stack: (M, N) unknowns' rows, then the orthonormal mains rows, then y.
@@ -68,7 +72,7 @@ def reduce_rows(stack: F8, extent: I8, free: int, matrix: F8, right: F8) -> floa
 
 @kernel("void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1])")
 def build(stack: F8, samples: F8, lamps: F8, common: F8, chips: F8, signs: F8, loose: I8, table: F8) -> None:
-    """Fill the unknowns' rows at the present phases: values, slopes, clock, pauses, and pieces of uncertain sign."""
+    """Fill the rows of the unknowns at the present phases: values, slopes, clock, pauses, pieces of uncertain sign."""
     n, size, pauses, last = lamps.shape[1], samples.shape[1], common.shape[1] - 2, loose.shape[1]
     free = 2 * n + 1 + pauses + last
     moved = np.empty((2, size))
@@ -102,7 +106,7 @@ def build(stack: F8, samples: F8, lamps: F8, common: F8, chips: F8, signs: F8, l
 
 @kernel("void(f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1])", inner=True)
 def _share_lag(matrix: F8, right: F8, amplitude: F8, normal: F8, target: F8) -> None:
-    """Normal equations in the unknowns: slopes times amplitude are phases, and the lag moves all of these.
+    """Normal equations of the unknowns: slopes times amplitude are phases, and the common delay shifts all phases.
 
     Args:
         matrix: (free, free) of the rows.
@@ -134,7 +138,7 @@ def _share_lag(matrix: F8, right: F8, amplitude: F8, normal: F8, target: F8) -> 
 
 @kernel("f8(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1], i8)", inner=True)
 def _move(lamps: F8, common: F8, theta: F8, variance: F8, bend: F8, size: int) -> float:
-    """Take the step, no farther than the columns reach; returns its size in chips where it matters.
+    """Apply the step, limited to the validity of the columns; returns its size in chips for significant lamps.
 
     The amplitude is corrected for the curvature of the correlation peak (slope energy over value energy).
     """
@@ -166,17 +170,17 @@ def _move(lamps: F8, common: F8, theta: F8, variance: F8, bend: F8, size: int) -
 
 @kernel("f8(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1])")
 def solve_once(stack: F8, lamps: F8, common: F8, loose_precision: F8, noise: F8, theta: F8, variance: F8) -> float:
-    """One Gauss-Newton step from the rows as they are; returns its size in chips where it matters.
+    """One Gauss-Newton step from the present rows; returns its size in chips for significant lamps.
 
-    Unknowns are those of the rows with one more, the lag, behind the slopes, because each phase moves with both its own
-    correction and the lag.
+    The unknowns are those of the rows and one more, the common delay, behind the slopes. Each phase moves with both its
+    own correction and the delay.
 
     Args:
-        stack: as :func:`build` has filled it, mains rows and y below.
-        lamps: see :data:`LAMP_ROWS`; amplitude, correction and variances are brought up to date.
+        stack: as filled by :func:`build`, mains rows and y below.
+        lamps: see :data:`LAMP_ROWS`; amplitude, correction and variances are updated.
         common: see :data:`COMMON_ROWS`; likewise.
         loose_precision: inverse prior variance of each uncertain piece.
-        noise: variance per sample, brought up to date; degrees of freedom.
+        noise: variance per sample, updated; degrees of freedom.
         theta: (free + 1,) out: the unknowns.
         variance: (free + 1,) out.
     """
@@ -209,7 +213,7 @@ def solve_once(stack: F8, lamps: F8, common: F8, loose_precision: F8, noise: F8,
         for b in range(free + 1):
             total += inverse[a, b] * pulled[b]
         theta[a] = total
-        variance[a] = noise[0] * inverse[a, a]  # of what has a prior: by the noise that weighed the prior
+        variance[a] = noise[0] * inverse[a, a]  # with the noise that weighted the prior
     for a in range(free + 1):
         product = 0.0
         for b in range(free + 1):
@@ -223,14 +227,14 @@ def solve_once(stack: F8, lamps: F8, common: F8, loose_precision: F8, noise: F8,
 
 @kernel("void(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[:,::1])")
 def leave(stack: F8, lamps: F8, scale: F8, theta: F8, out: F8) -> None:
-    """What the last step's solution leaves of the block, and the derivative of the whole signal by a common phase.
+    """Residual of the last step's solution, and the derivative of the whole signal by a common phase.
 
     Args:
         stack: as for :func:`solve_once`.
         lamps: after it.
         scale: amplitudes before it.
-        theta: what it has found.
-        out: (2, N).
+        theta: its solution.
+        out: (2, N) out.
     """
     n, size, free = lamps.shape[1], stack.shape[1], theta.shape[0] - 1
     weights = np.empty(free)

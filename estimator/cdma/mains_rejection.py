@@ -1,8 +1,8 @@
-"""What is in the ADC words beside coded light: offset, slow drift, and the flicker of mains lamps.
+"""Mains rejection: projects offset, slow drift and mains lamp flicker out of a block, and tracks the flicker frequency.
 
-A subspace is projected out of every block: constant, ramp, parabola, harmonics of the flicker, and the fundamental
-times t, which covers a fundamental that is a little off or changes its strength. Its frequency is tracked in cycles per
-sample, so that it takes the error of the sample clock with it.
+The subspace: constant, ramp, parabola, harmonics of the flicker, and the fundamental times t. The last one covers a
+fundamental of slightly other frequency or changing strength. The frequency is tracked in cycles per sample, so that it
+includes the error of the sample clock.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from estimator.numerics.arrays import Array
 
 FUNDAMENTALS_HZ: Final = (100.0, 120.0)
 PULL: Final = 0.03
-"""A tracked frequency may leave its nominal value by so much (sample clock and grid together)."""
+"""Largest relative deviation of a tracked frequency from its nominal value (sample clock and grid together)."""
 
 REBUILD: Final = 3e-5
-"""Relative frequency step that is worth a new basis: 0.003 Hz, 0.001 rad of the second harmonic at a block's ends."""
+"""Relative frequency step that justifies a new basis: 0.003 Hz, 0.001 rad of the second harmonic at a block's ends."""
 
 GAIN: Final = 0.5
-"""Share of the frequency error found in one block that is followed."""
+"""Share of the frequency error of one block that is corrected."""
 
 JUMP: Final = 5e-4
-"""Relative frequency error beyond which a block is believed to be disturbed rather than the grid to have moved."""
+"""Limit of the relative frequency error of one block: a larger one is a disturbance, not the grid."""
 
 _COS, _SIN, _T_COS, _T_SIN = 3, 4, 5, 6
 
@@ -52,7 +52,7 @@ def orthonormal(rows: Array) -> tuple[Array, Array]:
 
 
 class Mains:
-    """Follows the flicker's frequency and keeps the orthonormal basis for blocks of one size."""
+    """Frequency tracker of the flicker, with the orthonormal basis for blocks of one size."""
 
     def __init__(self, sample_rate: float, harmonics: int) -> None:
         self._rate = sample_rate
@@ -65,7 +65,7 @@ class Mains:
 
     @property
     def hertz(self) -> float:
-        """Fundamental of the flicker by the nominal sample clock; 0 before the first block."""
+        """Fundamental of the flicker (Hz) by the nominal sample clock; 0 before the first block."""
         return self._frequency * self._rate
 
     def rows(self, y: Array) -> Array:
@@ -75,14 +75,15 @@ class Mains:
         return self._fresh(len(y))
 
     def learn(self, y: Array) -> None:
-        """Follow the flicker of an undisturbed block, for the next one."""
+        """Track the flicker of an undisturbed block, for the next one."""
         self._follow(inner(self.rows(y), y), GAIN, JUMP)
 
     def masked(self, times: Array, mask: Array) -> Array:
-        """Orthonormal rows for a block with samples left out or a bent time base; ``times`` in samples."""
+        """Orthonormal rows for a block with masked samples or a corrected time base; ``times`` in samples."""
         return orthonormal(basis(times, self._frequency, self._harmonics) * mask)[0]
 
     def _fresh(self, size: int) -> Array:
+        """Basis for blocks of this size, recomputed if size or frequency changed."""
         moved = abs(self._frequency - self._built[1]) > REBUILD * self._frequency
         if size != self._built[0] or moved:
             rows = basis(np.arange(size, dtype=float), self._frequency, self._harmonics)
@@ -92,7 +93,7 @@ class Mains:
         return self._q
 
     def _follow(self, coefficient: Array, gain: float, jump: float) -> None:
-        """First-order frequency correction: a sinusoid that is off by d looks like t times its quadrature."""
+        """First-order frequency correction: a frequency error looks like t times the quadrature of the sinusoid."""
         c = inner(self._upper, coefficient).tolist()
         size, built = self._built
         power = c[_COS] ** 2 + c[_SIN] ** 2 + c[_T_COS] ** 2 + c[_T_SIN] ** 2
@@ -103,7 +104,7 @@ class Mains:
             self._frequency = min(max(followed, (1 - PULL) * self._nominal), (1 + PULL) * self._nominal)
 
     def _choose(self, y: Array) -> None:
-        """50 or 60 Hz grid, and its frequency to first order, from the first block."""
+        """Choose 50 or 60 Hz grid, and its frequency to first order, from the first block."""
         tried = []
         for hertz in FUNDAMENTALS_HZ:
             self._frequency = self._nominal = hertz / self._rate

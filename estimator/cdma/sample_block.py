@@ -1,4 +1,4 @@
-"""A block of samples as the solvers see it, what is expected of it, and what came out."""
+"""Data types of the block solvers: sampled block with mains basis, prior of the tracks, result of the fit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from estimator.numerics.arrays import Array
 
 
 def rows_of(*rows: Array) -> Array:
-    """Rows of one length as an array; `np.stack` takes four times as long."""
+    """Stack rows of one length into an array; `np.stack` takes four times as long."""
     out = np.empty((len(rows), len(rows[0])))
     for k, row in enumerate(rows):
         out[k] = row
@@ -25,8 +25,8 @@ class Sampled:
 
     Attributes:
         y: (N,) photocurrent in ADC steps, 0 where masked. x: (N,) chips from the middle, by the clock's best estimate.
-        mask: (N,) 1, or 0 for samples left out. q: (M, N) orthonormal rows of the mains subspace.
-        steps: sample indices before which the bus stood still; ``x`` already contains the first guess of each pause.
+        mask: (N,) 1, or 0 for masked samples. q: (M, N) orthonormal rows of the mains subspace.
+        steps: sample indices at which a bus stall ends; ``x`` already contains the initial length of each pause.
     """
 
     y: Array
@@ -37,7 +37,7 @@ class Sampled:
 
     @cached_property
     def samples(self) -> Array:
-        """(2, N) times and weights, as the kernels want them."""
+        """(2, N) times and weights, in the layout of the kernels."""
         return rows_of(self.x, self.mask)
 
     @cached_property
@@ -46,19 +46,19 @@ class Sampled:
         return self.project(self.y)
 
     def project(self, row: Array) -> Array:
-        """Take the mains subspace out of a row (not by a matrix product, which would wake BLAS threads)."""
+        """Remove the mains subspace from a row (not by a matrix product, which would start BLAS threads)."""
         return row - mixed(inner(self.q, row), self.q)
 
 
 @dataclass(eq=False)
 class Prior:
-    """What the tracks predict for the middle of the block; arrays (L,) except chips (L, C).
+    """Prediction of the tracks for the middle of the block; arrays (L,) except chips (L, C).
 
     Attributes:
         phase, rate: chips, and chips per nominal chip. phase_var: chips^2.
-        lag_var, clock_var: of the common lag (chips^2) and of the relative sample clock.
-        amplitude: ADC steps, as last seen; only says which lamps are strong.
-        bit_sum, bit_weight: what the last block already said about the first code period touched.
+        lag_var, clock_var: of the common delay (chips^2) and of the relative sample clock.
+        amplitude: ADC steps, of the last block; only ranks the lamps by strength.
+        bit_sum, bit_weight: soft bit of the first code period touched, from the last block.
     """
 
     chips: Array
@@ -72,19 +72,19 @@ class Prior:
     bit_weight: Array
 
     def lamps(self, more: Array | float = 0.0) -> Array:
-        """(2, L) phases, with a correction, and rates, as the kernels want them."""
+        """(2, L) phases, plus a correction ``more`` (chips), and rates, in the layout of the kernels."""
         return rows_of(self.phase + more, self.rate)
 
 
 @dataclass(eq=False)
 class Fit:
-    """Outcome; arrays (L,) unless said otherwise. Phases are corrections to the prior's, in chips.
+    """Result of the joint fit; arrays (L,) unless stated. Phases are corrections to the prior's, in chips.
 
     Attributes:
-        amplitude, amplitude_var: ADC steps. phase, phase_var: of each lamp beyond the common lag.
-        lag, lag_var, clock, clock_var: common lag and relative clock, corrections to the prior's.
-        steps: size of each stall beyond what ``x`` held, chips.
-        residual: (N,) what is left. noise_var: per sample.
+        amplitude, amplitude_var: ADC steps. phase, phase_var: of each lamp beyond the common delay.
+        lag, lag_var, clock, clock_var: common delay and relative clock, corrections to the prior's.
+        steps: length of each stall beyond that in ``x``, chips.
+        residual: (N,) of the fit. noise_var: per sample.
         soft, soft_var: (L, P) amplitude times data sign of each code period touched; variance inf where not touched.
         signs: (L, P) data signs used, 0 where left out.
         mixed_slope: (N,) derivative of the whole signal by a common phase.
@@ -108,5 +108,5 @@ class Fit:
 
     @property
     def clearest(self) -> float:
-        """Most significant amplitude, in standard deviations."""
+        """Largest amplitude in standard deviations."""
         return float(np.max(self.amplitude / np.sqrt(self.amplitude_var)))
