@@ -1,7 +1,7 @@
-"""Lamps that stand in one row: what they do not tell.
+"""Collinear lamps: extra covariance and minimum variances for the directions they cannot observe.
 
-The distance from the row they tell only by how weak they are all together, which is what is known least, and not on
-which side of it the robot is; a heading they tell by how that distance changes.
+Lamps on one line determine the distance from it only by their common RSS, the least certain quantity.
+They do not determine the side of the line. They determine the heading only by the change of that distance.
 """
 
 from __future__ import annotations
@@ -16,41 +16,48 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import add_turned
 
 ROW_M, ACROSS_M, ACROSS_RAD = 0.5, 1.0, 0.2
-"""Lamps less than the first off a line are a row; the second is allowed for across it, the third for the heading."""
+"""Distance (m) from a line within which lamps are collinear; extra sigma across the line, m; extra sigma of the
+heading, rad.
+"""
 
 SIDE_M, SIDE_RAD = 0.5, 0.2
-"""What no number of looks at a row makes surer than: beside walls a heading was led 15 deg astray, and more."""
+"""Minimum sigma across the line (m) and of the heading (rad) that no number of epochs of collinear lamps reduces.
+Beside walls the heading was wrong by 15 deg and more.
+"""
 
 SLIGHT, LASTING_S, LASTING_M = 0.1, 1.0, 0.15
-"""A row by less than the first is none; nor is one that has not lasted so many seconds: other lamps are hidden for a
-moment, and come to be in use again. Who has not gone so far under it knows the place by the lamps before."""
+"""Collinearity below which lamps are not collinear; time (s) and path length (m) below which the limits do not apply.
+Other lamps may be hidden for a moment only. Over a short path the earlier lamps still determine the pose.
+"""
 
 BENT_M = 0.7
-"""A place less certain than that was led astray by a heading that was not what it is now, along a row of lamps: what it
-is off by says nothing of that."""
+"""Position sigma (m) above which an error of position along collinear lamps carries no information about the heading.
+The wrong heading that caused it has changed since.
+"""
 
 SURE = 3.0
-"""An offset of fewer standard deviations of what has told it may be none."""
+"""Significance, in standard deviations, below which an offset may be zero."""
 
 FORGOTTEN_M, EPOCH_M = 0.1, 0.05
-"""Way with other lamps over which what a row has left in place and heading fades, by a factor of e in its variance; and
-how much of it one epoch can be."""
+"""Path length (m) with other lamps over which the variance left by collinear lamps fades by a factor of e; largest part
+of it in one epoch (m).
+"""
 
 KNOWN = 4096
-"""So many sets of lamps are remembered."""
+"""Most sets of lamps that are cached."""
 
 
 def doubt(catalogue: Catalogue, lamps: frozenset[int]) -> Array:
-    """Covariance (3, 3; m, m, rad in the survey's axes) to be added to a pose that these lamps have told.
+    """Extra covariance (3, 3; m, m, rad; survey axes) of a pose determined by these lamps.
 
-    Nothing where none of them is known. It is not to be changed by who gets it.
+    Zero if none of them is in the catalogue. The result is cached and must not be modified.
     """
     known = catalogue.doubts.get(lamps)
     if known is None:
         known = np.zeros((3, 3))
         at = [(lamp.x, lamp.y) for lamp in map(catalogue.by_id.get, sorted(lamps)) if lamp is not None]
         if at:
-            along, across, angle = spread(at)  # one lamp is a row both ways
+            along, across, angle = spread(at)  # a single lamp is collinear both ways
             wide, narrow = (math.exp(-variance / ROW_M**2) for variance in (along, across))
             add_turned(angle, np.array((ACROSS_M**2 * wide, ACROSS_M**2 * narrow, ACROSS_RAD**2 * narrow)), known)
         if len(catalogue.doubts) >= KNOWN:
@@ -61,15 +68,16 @@ def doubt(catalogue: Catalogue, lamps: frozenset[int]) -> Array:
 
 @dataclass(slots=True, eq=False)
 class Lately:
-    """What a row leaves behind; start with ``Lately()``.
+    """Extra covariance that collinear lamps leave behind; initial state ``Lately()``.
 
-    Place and heading that a row has led astray are not put right by the first lamp beside it. A pose 4 deg off and sure
-    to 2.9 took what one epoch with such a lamp seemed to add to a heading 49 deg off, and was 8 deg off, sure to 1.6.
+    The first lamp beside the line does not correct position and heading errors that collinear lamps have caused.
+    Example: a pose was 4 deg off with sigma 2.9 deg, its light heading 49 deg off. It accepted the information of one
+    such epoch, and was 8 deg off with sigma 1.6 deg.
 
     Attributes:
-        left: covariance (3, 3; m, m, rad; survey axes) to be added to what lamps tell now: by the lamps themselves, or
-            by those of the way of late where that is more.
-        usual: mean over the way with lamps, weighted by how long ago; None before the first. way: driven until then, m.
+        left: covariance (3, 3; m, m, rad; survey axes) to be added to the light pose now. It is that of the present
+            lamps, or of the recent ones where that is larger.
+        usual: mean over the path with lamps, with exponential weights; None before the first. way: path length then, m.
     """
 
     left: Array = field(default_factory=lambda: np.zeros((3, 3)))
@@ -77,28 +85,29 @@ class Lately:
     way: float = 0.0
 
     def take(self, more: Array, way: float) -> None:
-        """Take in the doubt about the lamps of an epoch (see `doubt`), after so much way (m).
+        """Update with the extra covariance of an epoch's lamps (see `doubt`) at a path length (m).
 
-        Way in the dark is none with other lamps: no epoch stands for more than `EPOCH_M`.
+        Path length without light does not count as path with other lamps: one epoch counts for at most `EPOCH_M`.
         """
         keep = math.exp(-min(way - self.way, EPOCH_M) / FORGOTTEN_M)
         self.usual, self.way = more if self.usual is None else keep * self.usual + (1.0 - keep) * more, way
         self.left = more if more.trace() >= self.usual.trace() else self.usual
 
     def narrow(self, off_m: float) -> float:
-        """How much of a row the lamps are, or were of late, 0 to 1: where they are less than so far off a line."""
+        """Collinearity of the present or recent lamps, 0 to 1, at a distance scale ``off_m`` from the line, m."""
         return math.pow(max(float(self.left[2, 2]), 0.0) / ACROSS_RAD**2, (ROW_M / off_m) ** 2)
 
 
 @dataclass(slots=True, eq=False)
 class Under:
-    """The row that lamps in use have become; start with ``Under()``.
+    """Collinearity of the lamps in use over time; initial state ``Under()``.
 
     Attributes:
-        t: since when, inf: they are none. at: (2,) where the robot was then, of its dead-reckoned way, m. far: how far
-            it has been from there since, m; inf: nothing but a row has told the pose. P: (3, 3; m, m, rad; survey axes)
-            what was known of the pose then.
-        told: lamps that are no row, or a person, have told the pose before.
+        t: instant since which they are collinear, inf: they are not. at: (2,) dead-reckoned position at that instant,
+            m.
+        far: largest distance from there since, m; inf: only collinear lamps have determined the pose.
+        P: (3, 3; m, m, rad; survey axes) covariance of the pose at that instant.
+        told: lamps that are not collinear, or the operator, have determined the pose before.
     """
 
     t: float = math.inf
@@ -108,9 +117,11 @@ class Under:
     told: bool = False
 
     def take(self, t: float, narrow: float, at: Array, P: Array) -> None:
-        """At ``t`` two lamps or more are in use, and ``narrow`` a row; place and covariance of the pose are these.
+        """Update at ``t`` with two or more lamps in use.
 
-        Fewer tell nothing of a row, nor that it is over: it would begin anew, with what it has told itself.
+        ``narrow``: their collinearity; ``at``, ``P``: dead-reckoned position and covariance of the pose. Fewer lamps
+        must not be passed in. They would end the collinear state, and it would restart with its own result as the
+        earlier pose.
         """
         if narrow <= SLIGHT:
             self.t, self.told = math.inf, True
@@ -120,24 +131,24 @@ class Under:
         self.far = max(self.far, float(np.hypot(*(at - self.at))))
 
     def lasts(self, t: float) -> bool:
-        """Whether they are more than a row for a moment."""
+        """Whether the lamps have been collinear for longer than a moment."""
         return t - self.t >= LASTING_S
 
     def least(self, angle: float) -> tuple[float, float]:
-        """Variances across a direction (m^2) and of the heading (rad^2) that looks at the row make no smaller."""
+        """Minimum variances across a direction (m^2) and of the heading (rad^2) under collinear lamps."""
         if self.far >= LASTING_M:
             return SIDE_M**2, SIDE_RAD**2
         return min(SIDE_M**2, across(angle, self.P)), min(SIDE_RAD**2, float(self.P[2, 2]))
 
 
 def across(angle: float, P: Array) -> float:
-    """Variance of a place across a direction, rad."""
+    """Variance (m^2) of a position across a direction (rad)."""
     nx, ny = -math.sin(angle), math.cos(angle)
     return float(nx * nx * P[0, 0] + 2.0 * nx * ny * P[0, 1] + ny * ny * P[1, 1])
 
 
 def shape(catalogue: Catalogue, lamps: frozenset[int]) -> tuple[float, float]:
-    """How much lamps are a row (1: on one line; 0: not at all, or fewer than two are known), and its direction, rad."""
+    """Collinearity of lamps (1: on one line; 0: none, or fewer than two known), and direction of the line, rad."""
     at = [(lamp.x, lamp.y) for lamp in map(catalogue.by_id.get, sorted(lamps)) if lamp is not None]
     if len(at) < 2:
         return 0.0, 0.0
@@ -146,19 +157,19 @@ def shape(catalogue: Catalogue, lamps: frozenset[int]) -> tuple[float, float]:
 
 
 def several(catalogue: Catalogue, lamps: frozenset[int]) -> bool:
-    """Whether two or more of these are known."""
+    """Whether two or more of these lamps are in the catalogue."""
     return sum(lamp in catalogue.by_id for lamp in lamps) > 1
 
 
 def loosen(narrow: float, angle: float, P: Array, least: tuple[float, float] = (SIDE_M**2, SIDE_RAD**2)) -> None:
-    """Keep a pose that a row of lamps has told from becoming surer across it than one look at them makes it.
+    """Raise the covariance of a pose to the minimum that collinear lamps allow, in place.
 
-    How far the lamps seem from the row is the same mistake in every epoch (walls beside, a common gain), and with it
-    the heading: believed twenty times a second it is soon held for certain, and is a mistake along the next row.
+    The apparent distance from the line has the same error in every epoch (walls beside it, common gain). So has the
+    heading. Averaged twenty times a second it would soon seem certain, and be wrong along the next line.
 
     Args:
-        narrow: how much the lamps in use are a row.
-        angle: its direction, rad; see `shape`.
+        narrow: collinearity of the lamps in use.
+        angle: direction of the line, rad; see `shape`.
         P: covariance, its first three rows and columns those of the pose in the survey's axes; changed in place.
         least: variances across it (m^2) and of the heading (rad^2), see `Under.least`.
     """
@@ -173,10 +184,10 @@ def loosen(narrow: float, angle: float, P: Array, least: tuple[float, float] = (
 
 
 def straighten(P: Array, X: Array) -> tuple[Array, Array]:
-    """Of a place that is hardly known, without wheels: it says nothing of the heading, nor the heading of the place.
+    """Without odometry: drop the covariance between position and heading where the position is uncertain (`BENT_M`).
 
     Args:
-        P: covariance (3, 3) of the place; not changed.
+        P: covariance (3, 3) of the pose; not changed.
         X: its covariance (3, 3) with another error; not changed.
     """
     if P[0, 0] + P[1, 1] <= BENT_M**2:
@@ -188,14 +199,14 @@ def straighten(P: Array, X: Array) -> tuple[Array, Array]:
 
 
 def sure_part(off: Array, P: Array) -> tuple[float, float]:
-    """Distance (m) and turn (rad) by which a pose is off, as far as what told the pose can be sure of it.
+    """Significant distance (m) and turn (rad) by which a pose is off, given the covariance ``P``.
 
-    Of a distance only what lies along those axes of its uncertainty on which it is beyond doubt: a place that is 1.4 m
-    across the row and half a metre along it is half a metre away.
+    The distance counts only along those axes of the uncertainty on which it is significant. A position 1.4 m off across
+    the line and half a metre along it is half a metre off.
 
     Args:
         off: x, y, yaw; m and rad.
-        P: covariance (3, 3) of what has told the pose, in the same axes.
+        P: covariance (3, 3) of the measured pose, in the same axes.
     """
     variances, axes = np.linalg.eigh(P[:2, :2])
     apart = axes.T @ off[:2]
@@ -205,7 +216,7 @@ def sure_part(off: Array, P: Array) -> tuple[float, float]:
 
 
 def spread(at: list[tuple[float, float]]) -> tuple[float, float, float]:
-    """Variances of points along and across the line that fits them best, and that line's direction."""
+    """Variances of points along and across their best-fitting line, and the direction of that line (rad)."""
     n = len(at)
     x, y = sum(p[0] for p in at) / n, sum(p[1] for p in at) / n
     xx, yy = sum((p[0] - x) ** 2 for p in at) / n, sum((p[1] - y) ** 2 for p in at) / n

@@ -1,4 +1,4 @@
-"""What the `lights` filter knows, and its settings; the equations are in state_vector.py and measurement_update.py."""
+"""State and settings of the light filter; the equations are in state_vector.py and measurement_update.py."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ from estimator.numerics.pose_history import PoseHistory
 from estimator.result import LightsResult
 
 SILENT_S = 0.5
-"""Light of which nothing could be used for so long says nothing of where the robot is now. One epoch may be lost."""
+"""Time (s) without usable light after which light carries no information about the present pose. One epoch may be
+lost.
+"""
 
 TRAIL_S = 1.0
-"""How far back the dead-reckoned poses are kept, s."""
+"""Length of the history of dead-reckoned poses, s."""
 
 
 class Pause(Enum):
@@ -36,29 +38,30 @@ class Pause(Enum):
 
 
 class Corrections(Protocol):
-    """A residual map: how the model errs for a lamp at a place (walls, shape of the luminaire)."""
+    """Residual map: error of the lamp model for a lamp at a position (walls, shape of the luminaire)."""
 
     def at(self, lamp_ids: Sequence[int], T_map_base: Array) -> Array:
-        """What to add to ln of the expected strengths.
+        """Value to be added to ln of the expected RSS.
 
         Returns:
-            One row per lamp: mean and sigma of ln, the mean's gradient along x and y (1/m). A negative sigma: the map
-            does not know this lamp.
+            One row per lamp: mean and sigma of ln RSS, gradient of the mean along x and y (1/m). Sigma is negative for
+                a lamp
+            that is not in the map.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class MotionErrors:
-    """One-sigma errors of odometry, gyro and of constant velocity; random parts by the root of way, turn or time.
+    """One-sigma errors of odometry, gyro and constant velocity; random parts grow with the root of path, turn or time.
 
     Attributes:
         slip, side: m per root metre, along and across. turn: rad per root radian. wander: rad per root metre.
-        skid: m per root radian turned: what a robot turns about is known to centimetres only.
+        skid: m per root radian turned: the centre of rotation is known to centimetres only.
         idle_m, idle_rad: per root second.
-        scale, turn_scale: share of the way and of the turn that wheels may be off for good. curve: rad per metre.
+        scale, turn_scale: constant relative error of path length and turn by odometry. curve: rad per metre.
         gyro: rad per root second. gyro_bias: rad/s.
         acceleration, angular: m/s and rad/s per root second, without odometry. sideways: speed across, m/s.
-        speed: what a robot without odometry may go at, m/s.
+        speed: sigma of the speed of a robot without odometry, m/s.
     """
 
     slip: float = 0.009
@@ -84,12 +87,14 @@ class ModelErrors:
     """One-sigma errors of the optical model.
 
     Attributes:
-        ln: of any link (walls, shape of the luminaire). floor: share of the diffuse part that differs from place to
-            place. lean: of a lamp beyond the survey, slope. white: ln, anew at every epoch (stamps, decoder).
-        edge: ln at the edge of view, falling off inward with the fourth power. order: of the receiver's Lambert order.
-        fade_m, fade_s: way and time after which they are others.
-        common: ln gain common to all lamps, at the start. floor_ln: ln of the diffuse share. tilt: receiver, slope.
-        gain_m, common_m, floor_m: how the lamps' gains, the common one and the floor wander, ln per root metre.
+        ln: of any link (walls, shape of the luminaire). floor: share of the diffuse part that varies with position.
+        lean: tilt of a lamp beyond the survey, m/m. white: ln, independent from epoch to epoch (stamps, decoder).
+        edge: ln at the edge of the field of view, falling off inward with the fourth power.
+        order: of the receiver's Lambert order.
+        fade_m, fade_s: path length and time over which model errors decorrelate.
+        common: ln gain common to all lamps, at the start. floor_ln: ln of the diffuse floor. tilt: receiver, m/m.
+        gain_m, common_m, floor_m: random walk of the lamps' gains, the common gain and the diffuse floor, ln per root
+            metre.
     """
 
     ln: float = 0.02
@@ -110,13 +115,13 @@ class ModelErrors:
 
 @dataclass(frozen=True, slots=True)
 class LightsSettings:
-    """One set for every building and robot; what differs stands in the survey.
+    """Settings of the light filter, the same for every building and robot; the survey holds what differs.
 
     Attributes:
-        link_n: how many of the strongest links are used, 0 for all. pause: see :class:`Pause`.
-        wait_s, wait_m: how long and how far a link stays paused after it fits again.
-        rim_rad: links nearer to the edge of view are not used. faint: least amplitude in sigmas.
-        headings: hypotheses of a start. decided: share of the probability that ends one.
+        link_n: number of the strongest links that are used, 0 for all. pause: see :class:`Pause`.
+        wait_s, wait_m: time and path length for which a link stays paused after it fits again.
+        rim_rad: links closer to the edge of the field of view are not used. faint: minimum RSS in sigmas.
+        headings: hypotheses per position at a start. decided: probability of one hypothesis that ends a start.
     """
 
     motion: MotionErrors = field(default_factory=MotionErrors)
@@ -133,13 +138,15 @@ class LightsSettings:
 
 @dataclass(slots=True)
 class Watch:
-    """The record of one lamp's links: since when it has been contradicting, and how steadily.
+    """Consistency record of one lamp's links.
 
     Attributes:
-        t_bad, way_bad: when it last did. t_run, way_run: when this run of contradictions began, inf if there is none.
-        count, total, square: of the residuals in the run. strikes: how often its gain was learned anew for that.
-        moved: it hangs elsewhere than the survey says, and is not used. paroles: how often that was taken back.
-        fitted: way on which it fitted, m, as far as it still counts. way_seen: when it was last compared.
+        t_bad, way_bad: time and path length of the last inconsistent link.
+        t_run, way_run: start of this run of inconsistent links, inf if there is none.
+        count, total, square: of the residuals in the run. strikes: number of times its gain was learned again.
+        moved: it is not at its surveyed position, and is not used. paroles: number of times that was revoked.
+        fitted: path length over which it fitted, m, as far as it still counts. way_seen: path length at the last
+            comparison.
     """
 
     t_bad: float = -math.inf
@@ -158,7 +165,7 @@ class Watch:
 
 @dataclass(slots=True, eq=False)
 class Track:
-    """One hypothesis: a state with its covariance, and which lamps stand in its slots.
+    """One light hypothesis: state with covariance, and the lamps in its slots.
 
     Attributes:
         x, P: (SIZE,) and (SIZE, SIZE). used: slots in use. lamps: (SLOTS, 7) for the kernels. slots: by lamp ID.
@@ -177,21 +184,21 @@ class Track:
 
     @property
     def n(self) -> int:
-        """Elements of the state in use."""
+        """Number of state elements in use."""
         return FIRST + OWN * self.used
 
 
 @dataclass(slots=True, eq=False)
 class Course:
-    """How the robot has moved, whatever place it is in.
+    """Motion of the robot, common to all hypotheses.
 
     Attributes:
-        t_mono: instant of the tracks' poses. t_odometry: end of the latest odometry. t_gyro: of the latest gyro.
-        wheels: whether odometry is alive. matched: it was matches that told it last, not wheels. velocity: (v_x, v_y,
-            yaw rate) by odometry and gyro. ahead: motion already applied beyond the last odometry.
-        gyro_turned, gyro_span: added up since the last odometry.
+        t_mono: instant of the hypotheses' poses. t_odometry: end of the latest odometry. t_gyro: of the latest gyro.
+        wheels: odometry is available. matched: its latest source was scan matches, not wheels.
+        velocity: (v_x, v_y, yaw rate) by odometry and gyro. ahead: motion already applied beyond the last odometry.
+        gyro_turned, gyro_span: gyro angle (rad) and time (s) summed since the last odometry.
         T, trail: dead-reckoned pose since the start, and its last second.
-        way: metres driven.
+        way: path length, m.
     """
 
     t_mono: float = -math.inf
@@ -210,20 +217,21 @@ class Course:
 
 @dataclass(slots=True, eq=False)
 class Lights:
-    """All of the filter; made by `light_filter.new_lights`, changed only by the functions of that module.
+    """State of the light filter; created by `light_filter.new_lights`, changed only by the functions of that module.
 
     Attributes:
-        tracks: hypotheses, likeliest first; one when the place is known, none before a start.
-        gains: by lamp ID, means and variances of (ln gain, lean x, lean y) of lamps that have left the slots.
-        t_epoch, way_epoch: of the latest epoch. t_used: when a link was last used. way_start: where the start began.
-        t_lost: since when most links contradict, inf if they do not. t_odd: since when several links are stronger than
-            they can be, which nothing in the way explains; way_odd: when it last was so.
-        under: the row that the lamps in use have become.
-        absent: by lamp ID, (instant, way) since which it should be received but is not.
-        corrections: a residual map, or None. lean: slopes of the floor under the robot, as an IMU tells.
-        lost: the last start was made necessary by a contradiction.
-        before: what an earlier run knew of the sensors, for the first hypothesis. recalled: and of lamps, as ``gains``.
-        bent: how far lamps are taken for others than was expected (`gain_memory.bend`).
+        tracks: hypotheses, likeliest first; one when the pose is decided, none before a start.
+        gains: by lamp ID, means and variances of (ln gain, tilt x, tilt y) of lamps that have left the slots.
+        t_epoch, way_epoch: of the latest epoch. t_used: when a link was last used. way_start: path length at the start.
+        t_lost: since when most links are inconsistent, inf if they are not.
+        t_odd: since when several links are stronger than possible, which no obstacle explains. way_odd: path length
+            then.
+        under: collinearity of the lamps in use.
+        absent: by lamp ID, (instant, path length) since which it should be received but is not.
+        corrections: residual map, or None. lean: tilt of the ground under the robot, from an IMU.
+        lost: inconsistent links caused the last start.
+        before: sensor states of an earlier run, for the first hypothesis. recalled: its lamp gains, as ``gains``.
+        bent: gain consistency (`gain_memory.bend`).
     """
 
     survey: Survey

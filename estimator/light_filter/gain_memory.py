@@ -1,4 +1,4 @@
-"""What the `lights` filter has learned that outlasts a hypothesis, and the process."""
+"""Lamp gains and sensor states that outlive a hypothesis and a run; gain consistency of the present hypothesis."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from estimator.light_filter.survey import Lamp
 from estimator.numerics.arrays import Array
 
 Learned = Mapping[int, tuple[Array, Array]]
-"""By lamp ID: means and variances of (ln gain, lean x, lean y)."""
+"""By lamp ID: means and variances of (ln gain, tilt x, tilt y)."""
 
 SENSORS = slice(state_vector.SCALE, state_vector.FIRST)
-"""States of motion sensing, receiver and floor, which are the same wherever the robot is."""
+"""States of odometry, gyro, receiver and diffuse floor, which do not depend on the pose."""
 
 DOUBT = np.array((0.03, 0.01, 0.01)) ** 2
-"""What a lamp's gain and lean lose by being remembered."""
+"""Variance added to a stored gain and tilt of a lamp."""
 LEAST: Sequence[float] = DOUBT.tolist()
-"""Nothing is expected more surely."""
+"""Minimum variance of an expected gain or tilt."""
 AGED = np.array((0.05, 0.02, 0.02)) ** 2
-"""What they lose from one run to the next: lamps age, and gather dust, while the robot is off."""
+"""Variance added from one run to the next: lamps age, and gather dust, while the robot is off."""
 
 
 def fresh_gains(lights: Lights) -> Learned:
-    """What the one hypothesis knows of its lamps, if it is worth believing."""
+    """Gains of the lamps in the slots of the single hypothesis; empty while its pose is not certain."""
     if len(lights.tracks) != 1 or not settled(lights.tracks[0]):
         return {}
     track = lights.tracks[0]
@@ -42,20 +42,20 @@ def fresh_gains(lights: Lights) -> Learned:
 
 
 def new_variance(lights: Lights, lamp_id: int) -> tuple[float, float, float]:
-    """Of (ln gain, lean x, lean y) of a lamp of which nothing has been learned."""
+    """Prior variances of (ln gain, tilt x, tilt y) of a lamp."""
     gain, lean = lights.catalogue.by_id[lamp_id].sigma_ln, lights.settings.model.lean
     return gain * gain, lean * lean, lean * lean
 
 
 def gains_known(lights: Lights) -> Learned:
-    """All that is known of the lamps' gains."""
+    """All stored lamp gains, with those of the present hypothesis."""
     return {**lights.gains, **fresh_gains(lights)}
 
 
 def expected_of(lights: Lights, lamp_id: int) -> tuple[Sequence[float], Sequence[float]]:
-    """Means and variances of a lamp's own (ln gain, lean x, lean y): of an earlier run, else as surveyed.
+    """Prior means and variances of a lamp's (ln gain, tilt x, tilt y): of an earlier run, else of the survey.
 
-    Not what this run has found so far: a place that is wrong has found lamps that fit it.
+    Values of this run are not used: a wrong pose would have found lamp gains that fit it.
     """
     if known := lights.recalled.get(lamp_id):
         return known[0].tolist(), known[1].tolist()
@@ -63,13 +63,13 @@ def expected_of(lights: Lights, lamp_id: int) -> tuple[Sequence[float], Sequence
 
 
 def bend(lights: Lights, used: list[Sight]) -> None:
-    """Note how far the likeliest hypothesis takes lamps for others than was expected (`model_consistency.Bent`).
+    """Update the gain consistency of the likeliest hypothesis (`model_consistency.Bent`).
 
-    Of a lamp it is the sum of the squares of what is taken for its own gain, its lean and the error of its link: in
-    deviations, of the link in usual ones, though at first more is allowed for. In plain numbers: arrays of three cost
-    a sixth of the whole update.
+    The value of a lamp is the sum of squared normalised deviations of its gain, tilt and link error. The link
+    error counts in its usual sigma, although its initial variance is larger. Plain numbers are used: arrays of three
+    would cost a sixth of the whole update.
 
-    ``used``: the links accepted in the latest epoch; none tell nothing, nor do those that an older hypothesis has used.
+    ``used``: links accepted in the latest epoch. Without any, or with those of another hypothesis, nothing changes.
     """
     if not lights.tracks:
         return
@@ -89,20 +89,20 @@ def bend(lights: Lights, used: list[Sight]) -> None:
 
 
 def sensors_known(lights: Lights) -> tuple[Array, Array] | None:
-    """Means and variances of :data:`SENSORS`, None while nothing worth keeping is known."""
+    """Means and variances of :data:`SENSORS`; None while none are certain enough to keep."""
     known = lights.tracks[0] if len(lights.tracks) == 1 and settled(lights.tracks[0]) else lights.before
     if known is None:
         return None
     mean, variance = known.x[SENSORS].copy(), np.diag(known.P)[SENSORS].copy()
-    if lights.course.matched:  # what it knows of scales is about matches, and would be taken for that of wheels
+    if lights.course.matched:  # its scales are those of scan matches, not of wheels
         mean[:3], variance[:3] = wheel_scales(lights)
     return mean, variance
 
 
 def recall(lights: Lights, gains: Learned, sensors: tuple[Array, Array] | None, lamps: tuple[Lamp, ...]) -> None:
-    """Begin with what an earlier run has learned. The survey wins over what a lamp said of itself then.
+    """Start from the gains, sensor states and described lamps of an earlier run. The survey overrides described lamps.
 
-    A lamp known by its own word is not among those that may be let go until it is heard again.
+    A lamp that described itself is not subject to removal until it is received again.
     """
     catalogue = lights.catalogue
     for lamp in lamps:

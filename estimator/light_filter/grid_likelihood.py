@@ -1,4 +1,4 @@
-"""Where the robot can be according to one epoch: maximum likelihood over a grid, compiled."""
+"""Maximum-likelihood grid search for the position from a single light epoch, compiled."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 COMMON_VARIANCE: Final = 0.25**2
-"""Of the ln gain that all lamps share: dirt on the receiver, another resistor, another supply."""
+"""Variance of the common ln gain: dirt on the receiver, another resistor, another supply."""
 
 CAP: Final = 9.0
-"""A link three sigma off counts no more, however far off it is: it may be covered, moved, or somewhere else."""
+"""Limit of a link's squared deviation (three sigma): it may be covered, moved, or somewhere else."""
 
 
 @kernel("f8(f8[::1], f8[::1], i8, f8, f8[::1])", inner=True)
 def common_gain(r: Array, s2: Array, n: int, prior2: float, best: Array) -> float:
-    """The gain common to all links that explains their residuals best, robustly.
+    """Common gain that best explains the residuals of all links, robustly.
 
     Args:
         r: (n,) ln(received / expected).
         s2: (n,) variances of those.
-        n: how many.
+        n: number of links.
         prior2: variance of the common gain.
-        best: (1,), filled with the gain.
+        best: (1,) out: the gain.
 
     Returns:
         Sum of squared deviations, each capped, and of the gain's own.
@@ -35,7 +35,7 @@ def common_gain(r: Array, s2: Array, n: int, prior2: float, best: Array) -> floa
     for c in range(n + 1):
         g = 0.0 if c == n else r[c]
         up, down = 0.0, 1.0 / prior2
-        for i in range(n):  # among those that agree with this guess, their mean
+        for i in range(n):  # weighted mean of the links that agree with this start value
             if (r[i] - g) ** 2 < CAP * s2[i]:
                 up += r[i] / s2[i]
                 down += 1.0 / s2[i]
@@ -56,10 +56,10 @@ def search(lamps: Array, rx: Array, links: Array, poses: Array, floor: float, ou
     Args:
         lamps: (n, 7) of the links, rows of `lambertian.pack_lamps`.
         rx: (9,) receiver.
-        links: (n, 2) ln amplitude, and its variance with all that the gain and the model may be wrong by.
+        links: (n, 2) ln RSS, and its variance including the errors of gain and model.
         poses: (G, 3).
-        floor: diffuse share.
-        out: (G, 3), filled with cost, common gain, and how many links fit.
+        floor: diffuse floor.
+        out: (G, 3) out: cost, common gain, number of links that fit.
     """
     n = lamps.shape[0]
     r, s2, J, said, best = np.empty(n), np.empty(n), np.empty(COLUMNS), np.empty(3), np.empty(1)

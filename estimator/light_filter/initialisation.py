@@ -1,4 +1,4 @@
-"""The start: places by maximum likelihood, a hypothesis for each with several headings, until motion has decided."""
+"""Multi-hypothesis initialisation: positions by maximum likelihood, several headings each, until motion decides."""
 
 from __future__ import annotations
 
@@ -20,28 +20,34 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 
 LEAST = 3
-"""Links without which there is no start: two leave two places, and their gains are not known."""
+"""Links needed for a start: two leave two positions, and their gains are uncertain."""
 STEP_M = 0.35
+"""Spacing of the grid, m."""
 APART_M = 0.8
-"""Minima nearer to each other than that are one; the filter finds its bottom."""
+"""Distance (m) below which two minima are one; the filter finds its lowest point."""
 PLACES = 6
+"""Most positions of a start."""
 RIVAL = 9.0
-"""A place whose cost is larger than the best one's by less than this is kept as a rival."""
+"""Cost above the best up to which a position is kept as a competing hypothesis."""
 SEEDS = 3
+"""Number of strongest links whose lamps are tried."""
 SIGMA_M = 0.4
+"""Initial sigma of a position, m."""
 GIVEN_UP = 15.0
-"""A hypothesis whose ln probability is worse than the best one's by so much is dropped."""
+"""ln probability below the best one's at which a hypothesis is dropped."""
 SAME_M, SAME_RAD = 0.15, 0.25
+"""Differences of position (m) and heading (rad) below which two hypotheses are the same."""
 REVERSE = 1.0
-"""What a hypothesis loses in ln probability with every epoch in which it drives backward without wheels that say so:
-strengths alone cannot tell a robot that drives from its mirror image that reverses."""
+"""Loss of ln probability per epoch of a hypothesis that drives backward without odometry to confirm it. RSS alone
+cannot distinguish a robot that drives from its mirror image that reverses.
+"""
 MOVED_M = 0.3
-"""Way before which no heading is believed."""
+"""Path length (m) before which no heading is accepted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the receiver can be: x, y (m), cost, common ln gain, and how many of how many links fit."""
+    """Candidate position of the receiver: x, y (m), cost, common ln gain, number of links that fit, number of links."""
 
     x: float
     y: float
@@ -52,9 +58,9 @@ class Place:
 
 
 def places(lights: Lights, epoch: LightEpoch, rival: float = RIVAL) -> list[Place]:
-    """All places at which an epoch's direct links fit, best first; none when too few links are direct or fit.
+    """Positions at which an epoch's direct links fit, best first; empty if too few links are direct or fit.
 
-    ``rival``: one whose cost is larger than the best one's by as much is none.
+    ``rival``: cost above the best at which a position is discarded.
     """
     found: list[Place] = []
     tried: set[tuple[int, ...]] = set()
@@ -75,7 +81,7 @@ def places(lights: Lights, epoch: LightEpoch, rival: float = RIVAL) -> list[Plac
 
 
 def seeds(lights: Lights, epoch: LightEpoch) -> list[Lamp]:
-    """Every lamp that one of the strongest links can come from."""
+    """Lamps from which one of the strongest links may come."""
     out: dict[int, Lamp] = {}
     order = [i for i in np.argsort(-epoch.amplitude) if np.isfinite(epoch.amplitude[i])]
     for i in order[:SEEDS]:
@@ -88,7 +94,7 @@ def seeds(lights: Lights, epoch: LightEpoch) -> list[Lamp]:
 
 
 def direct(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]:
-    """The links that have come straight, each from the lamp it comes from if the receiver is near a place."""
+    """Line-of-sight links, each with its lamp, for a receiver near (x, y) in m."""
     return [
         sight
         for sight in sights(lights, epoch, x, y)
@@ -97,13 +103,13 @@ def direct(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]
 
 
 def straight(lights: Lights, lamp: Lamp, amplitude: float) -> bool:
-    """Whether so much of a lamp's light has come straight: what is hidden from it gets less, wherever it is."""
+    """Whether the RSS proves line of sight: a hidden lamp is received more weakly at any position."""
     gain = float(remembered(lights, lamp)[0][0])
     return amplitude > DIFFUSE * math.exp(gain) * lights.catalogue.rims[lamp.lamp_id]
 
 
 def minima(lights: Lights, used: list[Sight]) -> list[Place]:
-    """The lowest places of a grid around the strongest lamp."""
+    """Lowest minima of a grid around the strongest lamp."""
     lamps = [sight.lamp for sight in used if sight.lamp is not None]
     table = pack_lamps(lamps, lights.survey.depth)
     receiver = replace(lights.survey.receiver, x=0.0, y=0.0, slope_x=0.0, slope_y=0.0)
@@ -127,7 +133,7 @@ def minima(lights: Lights, used: list[Sight]) -> list[Place]:
 
 
 def grid(x: float, y: float, reach: float) -> Array:
-    """Poses in a circle around a point."""
+    """Poses (n, 3) in a circle around a point."""
     axis = np.arange(-reach, reach + STEP_M, STEP_M)
     u, v = np.meshgrid(axis, axis)
     inside = np.hypot(u, v) <= reach
@@ -135,10 +141,10 @@ def grid(x: float, y: float, reach: float) -> Array:
 
 
 def begin(lights: Lights, found: list[Place], yaws: Array, sigma_yaw: float) -> None:
-    """Put up one hypothesis for every place and heading; what is known of gains and sensor errors is kept.
+    """Create one hypothesis per position and heading; gains and sensor states are kept.
 
-    Their covariances are one block, which the system gets back as a whole when the start has been decided: piece by
-    piece, each start left some of them in the heap, as holes among what is kept.
+    Their covariances share one block of memory, which is freed as a whole after the start. Separate blocks left holes
+    in the heap at each start.
     """
     old = lights.tracks[0] if lights.tracks else lights.before
     lights.tracks = []
@@ -157,7 +163,7 @@ def begin(lights: Lights, found: list[Place], yaws: Array, sigma_yaw: float) -> 
 
 
 def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track | None, zeros: Array) -> Track:
-    """A hypothesis at a pose, independent of everything else; motion errors and the floor as an old one knew them.
+    """Hypothesis at a pose, independent of everything else; sensor states and diffuse floor come from an old one.
 
     ``zeros``: (SIZE, SIZE), becomes its covariance.
     """
@@ -192,12 +198,12 @@ def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track |
 
 
 def headings(count: int) -> tuple[Array, float]:
-    """Evenly spread headings and the sigma with which they cover the circle."""
+    """Evenly spread headings (rad), and the sigma with which they cover the circle."""
     return np.asarray(2.0 * math.pi / count * np.arange(count)), 0.5 * 2.0 * math.pi / count
 
 
 def decide(lights: Lights) -> None:
-    """Order hypotheses by probability, merge those that have met, drop the hopeless, end the start when one is left."""
+    """Rank the hypotheses, merge equal ones, drop improbable ones, and end the start when one is left."""
     if not lights.course.wheels:
         for track in lights.tracks:
             sigma = math.sqrt(max(float(track.P[state_vector.SPEED, state_vector.SPEED]), 0.0))
@@ -220,17 +226,18 @@ def decide(lights: Lights) -> None:
 
 
 def go_on(lights: Lights, kept: list[Track]) -> None:
-    """Drop all other hypotheses, and, with one left, the block that they have shared."""
+    """Drop all other hypotheses and, with one left, their shared memory block."""
     if len(kept) == 1 and kept[0].P.base is not None:
         kept[0].P = kept[0].P.copy()
     lights.tracks = kept
 
 
 def rule_out(lights: Lights, epoch: LightEpoch) -> None:
-    """Drop hypotheses from which lamps cannot be seen that have said which ones they are.
+    """Drop hypotheses that cannot see lamps whose data frames were received.
 
-    Where codes repeat this decides, even at rest. The last ones go, and the start begins anew with what the lamps have
-    said, only if most of these lamps, and two at least, are out of their sight: one alone may have been moved.
+    Where codes repeat this decides, even at rest. The last hypotheses are dropped, and the start restarts with the
+    frames,
+    under one condition: most of these lamps, and at least two, are out of sight. A single one may have been moved.
     """
     named = [
         (lights.catalogue.by_id[frame.lamp_id], float(epoch.amplitude[i]))
@@ -245,7 +252,7 @@ def rule_out(lights: Lights, epoch: LightEpoch) -> None:
 
 
 def out_of_sight(lights: Lights, track: Track, lamp: Lamp) -> bool:
-    """Whether a lamp is beyond the field of view wherever a hypothesis allows the receiver to be."""
+    """Whether a lamp is beyond the field of view for every position that a hypothesis allows."""
     rx = lights.survey.receiver
     spread = 3.0 * math.sqrt(max(float(track.P[0, 0] + track.P[1, 1]), 0.0)) + APART_M
     reach = (lamp.z - rx.z) * math.tan(min(rx.half_fov_rad, 1.3)) + spread
@@ -259,7 +266,7 @@ def same(a: Track, b: Track) -> bool:
 
 
 def probabilities(tracks: list[Track]) -> Array:
-    """Of each hypothesis, summing to one."""
+    """Probability of each hypothesis, summing to one."""
     weights = np.array([track.weight for track in tracks])
     chances = np.exp(weights - weights.max())
     return np.asarray(chances / chances.sum())

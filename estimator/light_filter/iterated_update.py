@@ -1,15 +1,15 @@
-"""Eq. 5-7 where the equations bend: the update is repeated around its own outcome, no farther than it betters the fit.
+"""Iterated EKF update (Eq. 5-7) with step halving, and noise inflation by the joint NIS.
 
-What is minimised is the squared deviation from the prediction and from the links together (an iterated Kalman update is
-Gauss and Newton's way down that sum). Beside a row of lamps, or between two of them, strengths hardly change with the
-place across: a full step from there overshoots, and the next one from where it has come to more so. A step is therefore
-halved as long as that helps, and the state never ends where the sum is larger than it is at the prediction.
+The cost is the squared deviation from the prediction and from the links together. The iterated Kalman update is
+Gauss-Newton on that sum. Beside a line of lamps, or between two lines, RSS hardly changes with the position across. A
+full step from there overshoots, and the next one overshoots more. A step is therefore halved as long as that reduces
+the cost. The result never costs more than the prediction.
 
-Nor does one epoch lead it farther than it may be. Links may be likely one by one and impossible together: what is
-uncertain (gains, the distance from a row) moves all of them alike, and they have moved apart. Then light has changed,
-as at a corner behind which other walls are lit, and what explains it best is a state that cannot be. Their noise is
-multiplied then until all of it together is no more improbable than one epoch in a thousand (Chang 2014, Journal of
-Geodesy 88:391, for an update that is not iterated).
+The influence of one epoch is limited. Links may be likely one by one and impossible together: uncertain quantities
+(gains, distance from the line) change all of them alike, but they have changed differently. The light has then changed,
+as at a corner behind which other walls are lit. The state that explains it best is impossible. The noise is then
+multiplied until the links together are no more improbable than one epoch in a thousand. Chang 2014, Journal of Geodesy
+88:391, does so for an update that is not iterated.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 
 NEAR_M, NEAR_RAD = 0.03, 0.03
-"""A step of less needs no other."""
+"""Step (m, rad) below which the iteration ends."""
 STEPS: Final = 8
+"""Most iterations."""
 SHORTEST: Final = 1.0 / 64.0
-"""Part of a step below which it is not worth going."""
+"""Shortest part of a step that is tried."""
 IMPROBABLE: Final = 3.09
-"""Standard deviations: once in a thousand epochs, links together are farther off if all is as it is taken to be."""
+"""Standard deviations of one epoch in a thousand: the joint NIS exceeds it so rarely if the model holds."""
 WIDER: Final = 4.0
-"""By that factor noise is multiplied at a time."""
+"""Factor by which the noise is multiplied at a time."""
 JITTER: Final = 1e-12
-"""Variance that is added to elements which are known for certain, so that a deviation of them has a price."""
+"""Variance added to elements without uncertainty, so that their deviation has a finite cost."""
 
 
 class Seen(NamedTuple):
-    """Links and what they are compared by.
+    """Links with the data for their comparison.
 
     Attributes:
         links: (L, LINK_COLUMNS). lamps: (slots, 7), rows of `lambertian.pack_lamps`. view: (VIEW_COLUMNS,), see
@@ -52,19 +53,20 @@ class Seen(NamedTuple):
 
 
 def take_in(x: Array, P: Array, n: int, seen: Seen, out: Array, *, bounded: bool) -> float:
-    """Take links in, linearised anew where the outcome lies far from where they were.
+    """Update the state with links, linearised again where the result is far from the linearisation point.
 
     Args:
         x: state, changed in place.
         P: its covariance, changed in place.
         n: elements in use.
         seen: the links.
-        out: (L, OUT_COLUMNS) of `linearise` at ``x``, with the noise that each link is given (infinite: left out);
-            where they are improbable together it is multiplied.
-        bounded: whether that is done. Where hypotheses are compared, what is improbable speaks against one of them.
+        out: (L, OUT_COLUMNS) of `linearise` at ``x``, with the noise of each link (infinite: not used). The noise is
+            multiplied where the links are improbable together.
+        bounded: whether to inflate the noise. It is False while hypotheses compete, where improbable links are
+            evidence.
 
     Returns:
-        ln of the likelihood of these links at the prediction, with the noise that they came with.
+        ln of the likelihood of these links at the prediction, with their original noise.
     """
     used = out[:, WHITE] < math.inf
     if not np.any(used):
@@ -74,7 +76,7 @@ def take_in(x: Array, P: Array, n: int, seen: Seen, out: Array, *, bounded: bool
     if not bounded or left <= (most := nis_bound(int(np.count_nonzero(used)))):
         return likelihood
     white = out[used, WHITE]
-    factor, enough = 1.0, float(np.sum(out[used, RESIDUAL] ** 2 / white)) / most  # enough for the prediction itself
+    factor, enough = 1.0, float(np.sum(out[used, RESIDUAL] ** 2 / white)) / most  # at this the prediction passes
     while left > most and factor < enough:
         factor = min(WIDER * factor, enough)
         out[used, WHITE] = factor * white
@@ -84,7 +86,7 @@ def take_in(x: Array, P: Array, n: int, seen: Seen, out: Array, *, bounded: bool
 
 
 def nis_bound(links: int) -> float:
-    """What the NIS of so many links exceeds once in a thousand: chi-square's quantile by Wilson and Hilferty (1931)."""
+    """NIS that ``links`` links exceed once in a thousand epochs: chi-square quantile by Wilson and Hilferty (1931)."""
     spread = 2.0 / (9.0 * links)
     return links * float(1.0 - spread + IMPROBABLE * math.sqrt(spread)) ** 3
 
@@ -92,7 +94,7 @@ def nis_bound(links: int) -> float:
 def _iterate(
     state: tuple[Array, Array], before: tuple[Array, Array], n: int, seen: Seen, out: Array
 ) -> tuple[float, float]:
-    """The update, in place; ln of the likelihood at the prediction ``before``, and the sum that is left in the end."""
+    """Iterated update in place; returns ln of the likelihood at the prediction ``before``, and the final cost."""
     (x, P), (x0, P0) = state, before
     likelihood, nis = absorb(x, P, n, x0, seen.links, out)
     if _near(x, x0):
@@ -108,14 +110,14 @@ def _iterate(
         absorb(x, P, n, around, seen.links, out)
         if _near(x, around):
             return likelihood, price.of(x, price.look(x, seen))
-    x[:] = around  # the last step led nowhere better: P is what the links tell there
+    x[:] = around  # the last step did not reduce the cost; P is the covariance at ``around``
     return likelihood, cost
 
 
 class _Price:
-    """Sum of squared deviations, each over its variance, of a state from the prediction and from the links in use.
+    """Cost of a state: squared deviations from the prediction and from the links in use, each over its variance.
 
-    States that differ from the prediction by ``P0 H'`` times anything are told by those elements that links depend on.
+    States differ from the prediction by ``P0 H'`` times a vector. The elements that links depend on determine them.
     """
 
     def __init__(self, x0: Array, P0: Array, links: Array, out: Array) -> None:
@@ -128,14 +130,14 @@ class _Price:
         invert(self._L)
 
     def look(self, x: Array, seen: Seen) -> Array:
-        """What `linearise` says of the links at ``x``, with the noise that they were given."""
+        """`linearise` of the links at ``x``, with their assigned noise."""
         out = np.zeros((len(seen.links), OUT_COLUMNS))
         linearise(x, self._P0, *seen, out)
         out[:, WHITE] = self._white
         return out
 
     def of(self, x: Array, out: Array) -> float:
-        """``out``: what `linearise` says of the links at ``x``."""
+        """Cost of ``x``; ``out``: `linearise` of the links at ``x``."""
         off = x - self._x0
         off[YAW] = se2.wrap(float(off[YAW]))
         off, r = off[self._at], out[self._used, RESIDUAL]
@@ -144,7 +146,7 @@ class _Price:
 
 
 def _further(price: _Price, around: Array, x: Array, cost: float, seen: Seen) -> tuple[Array, float, Array] | None:
-    """Where it is cheapest between ``around`` and ``x``, halving the way: there, its cost, the links; None: nowhere."""
+    """Cheapest state between ``around`` and ``x`` by step halving: state, cost, links; None if none is cheaper."""
     step = x - around
     step[YAW] = se2.wrap(float(step[YAW]))
     part, best = 1.0, None
@@ -162,5 +164,6 @@ def _further(price: _Price, around: Array, x: Array, cost: float, seen: Seen) ->
 
 
 def _near(x: Array, around: Array) -> bool:
+    """Whether two states differ by less than `NEAR_M` and `NEAR_RAD`."""
     step = x[:3] - around[:3]
     return math.hypot(*step[:2].tolist()) < NEAR_M and abs(se2.wrap(float(step[2]))) < NEAR_RAD

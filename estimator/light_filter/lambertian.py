@@ -1,11 +1,11 @@
-"""Eq. 1, 2 and 7: what the photodiode receives of a ceiling lamp, and how that changes with everything it depends on.
+"""Lambertian lamp model (Eq. 1, 2 and 7): expected photocurrent of a ceiling lamp, with its Jacobian.
 
 Eq. 1    H = (m_t + 1) A / (2 pi d^2) * cos(alpha)^m_t * cos(beta)^m_r     for beta <= half field of view, else 0
 Eq. 2    a = responsivity * depth * P_t * exp(gain) * (H + floor * N),     N = (m_t + 1) A / (2 pi h^2)
 
-alpha is measured from the lamp's axis, beta from the receiver's; h is the lamp's height above the receiver, so N is
-H directly below a level lamp. ``floor`` is the diffuse part (light that came by ceiling, walls and furniture), the
-same share for all lamps. Filter and concentrator (T_s, G) are part of the area A. Eq. 7 is the Jacobian of a.
+alpha is the angle to the lamp's axis, beta to the receiver's. h is the lamp's height above the receiver, so N is H
+directly below a level lamp. ``floor`` is the diffuse floor (light that came by ceiling, walls and furniture), the same
+share for all lamps. Filter and concentrator (T_s, G) are part of the area A. Eq. 7 is the Jacobian of a.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from estimator.numerics.jit import kernel
 
 
 class Wrt(IntEnum):
-    """Columns of a Jacobian: what the amplitude is derived by."""
+    """Columns of a Jacobian: the variables of the derivatives."""
 
     X = 0  # base in the map, m
     Y = 1
     YAW = 2
     GAIN = 3  # ln of the lamp's power
-    FLOOR = 4  # share of the diffuse part
+    FLOOR = 4  # diffuse floor
     ORDER = 5  # m_t
     LAMP_SLOPE_X = 6
     LAMP_SLOPE_Y = 7
@@ -48,16 +48,16 @@ COLUMNS: Final = len(Wrt)
 LAMP_COLUMNS: Final = 7
 RECEIVER_COLUMNS: Final = 9
 LEAST_HEIGHT_M: Final = 0.05
-"""A lamp lower than that above the receiver is taken to be so high; a survey is wrong there, not the light."""
+"""Minimum height of a lamp above the receiver in the model; a lower one is an error of the survey, not of the light."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """What lamps would be received as. Arrays have one row per lamp.
+    """Expected RSS. Arrays have one row per lamp.
 
     Attributes:
-        amplitude: (n,) A, of the modulated photocurrent. direct: (n,) A, the part that came straight (line of sight).
-        jacobian: (n, 17) of ln amplitude, columns of :class:`Wrt`; zero where nothing at all is received.
+        amplitude: (n,) RSS, A, of the modulated photocurrent. direct: (n,) its line-of-sight part, A.
+        jacobian: (n, 17) of ln RSS, columns of :class:`Wrt`; zero where nothing is received.
         beta_rad: (n,) angle to the receiver's axis.
     """
 
@@ -74,7 +74,7 @@ def pack_lamps(lamps: Sequence[Lamp], depth: float) -> Array:
 
 
 def pack_receiver(receiver: Receiver) -> Array:
-    """The receiver as ``x, y, z, area, responsivity, order, cos(half fov), slope_x, slope_y`` for the kernels."""
+    """Receiver as ``x, y, z, area, responsivity, order, cos(half fov), slope_x, slope_y`` (9,) for the kernels."""
     r = receiver
     cos_fov = float(np.cos(r.half_fov_rad))
     return np.array((r.x, r.y, r.z, r.area_m2, r.responsivity, r.order, cos_fov, r.slope_x, r.slope_y))
@@ -82,18 +82,18 @@ def pack_receiver(receiver: Receiver) -> Array:
 
 @kernel("f8(f8[::1], f8[::1], f8[::1], f8, f8[::1], f8[::1])", inner=True)
 def expect(lamp: Array, rx: Array, pose: Array, floor: float, out: Array, J: Array) -> float:
-    """Amplitude of one lamp (at gain 0) and its derivatives.
+    """RSS of one lamp (at gain 0) and its derivatives.
 
     Args:
         lamp: (7,) of `pack_lamps`.
         rx: (9,) of `pack_receiver`.
         pose: (x, y, yaw) of the base in the map.
-        floor: the diffuse share.
-        out: (3,) is filled with the amplitude (A), its direct part (A) and cos(beta).
-        J: (17,) is filled with the derivatives of the amplitude (not of its logarithm).
+        floor: the diffuse floor.
+        out: (3,) out: RSS (A), its direct part (A) and cos(beta).
+        J: (17,) out: derivatives of the RSS (not of its logarithm).
 
     Returns:
-        The amplitude, A.
+        The RSS, A.
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     arm_x, arm_y = c * rx[0] - s * rx[1], s * rx[0] + c * rx[1]
@@ -138,19 +138,19 @@ def expect(lamp: Array, rx: Array, pose: Array, floor: float, out: Array, J: Arr
 
 @kernel("void(f8[:, ::1], f8[::1], f8[::1], f8, f8[:, ::1], f8[:, ::1])")
 def expect_all(lamps: Array, rx: Array, pose: Array, floor: float, out: Array, J: Array) -> None:
-    """:func:`expect` for every lamp; ``out`` (n, 3) and ``J`` (n, 17) are filled."""
+    """:func:`expect` for every lamp; fills ``out`` (n, 3) and ``J`` (n, 17)."""
     for i in range(lamps.shape[0]):
         expect(lamps[i], rx, pose, floor, out[i], J[i])
 
 
 def expected(lamps: Sequence[Lamp], survey: Survey, T_map_base: Array, floor: float | None = None) -> Expected:
-    """What these lamps would be received as from a pose, with the survey's receiver and depth.
+    """Expected RSS of these lamps from a pose, with the survey's receiver and depth.
 
     Args:
         lamps: any, surveyed or self-described.
         survey: for receiver and depth.
         T_map_base: (x, y, yaw).
-        floor: the diffuse share; the survey's where None.
+        floor: the diffuse floor; the survey's where None.
     """
     table, rx = pack_lamps(lamps, survey.depth), pack_receiver(survey.receiver)
     n = len(table)
