@@ -1,4 +1,4 @@
-"""Which lamps there are: those of the survey, and those that described themselves in their data frames."""
+"""Lamp catalogue: the lamps of the survey, and those that described themselves in their data frames."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from estimator.light_filter.survey import Lamp, Receiver, Survey
 from estimator.numerics.arrays import Array
 
 CONTRADICTION_M = 0.3
-"""A lamp whose own word differs from the survey by more is another one, or was moved, or one of the two is wrong."""
+"""Distance (m) between data frame and survey above which they disagree: another lamp, a moved one, or a wrong entry."""
 CONTRADICTION_LN = 0.25
+"""Difference of ln power above which they disagree, beyond three sigmas of the survey."""
 FRAME_SIGMA_LN = 0.15
-"""A lamp knows its rated power, not what is left of it."""
+"""One sigma of ln power of a lamp that described itself: it sends its rated power, not what is left of it."""
 
 
 def lamp_of(frame: LampFrame, code: int) -> Lamp:
-    """A lamp as it describes itself; where it does not tell its half angle, the usual one is taken."""
+    """Lamp as described in its data frame; the usual half angle where the frame has none."""
     lamp = Lamp(frame.lamp_id, code, frame.x_m, frame.y_m, frame.z_m, sigma_ln=FRAME_SIGMA_LN)
     order = lamp.order
     if 1.0 <= frame.half_angle_deg < 90.0:
@@ -30,14 +31,14 @@ def lamp_of(frame: LampFrame, code: int) -> Lamp:
 
 
 def contradicts(frame: LampFrame, code: int, lamp: Lamp) -> bool:
-    """Whether a lamp says something else of itself than the survey does."""
+    """Whether a data frame disagrees with a lamp of the catalogue."""
     away = math.dist((frame.x_m, frame.y_m, frame.z_m), (lamp.x, lamp.y, lamp.z))
     power = abs(math.log(frame.power_w / lamp.power_w)) if frame.power_w > 0.0 and lamp.power_w > 0.0 else 0.0
     return code != lamp.code or away > CONTRADICTION_M or power > CONTRADICTION_LN + 3.0 * lamp.sigma_ln
 
 
 def rim_amplitude(lamp: Lamp, rx: Receiver, depth: float) -> float:
-    """What a lamp gives at the very edge of view of a level receiver, A."""
+    """RSS of a lamp at the very edge of the field of view of a level receiver, A."""
     h = max(lamp.z - rx.z, 0.1)
     nadir = (lamp.order + 1.0) * rx.area_m2 / (2.0 * math.pi * h * h) * rx.responsivity
     return depth * lamp.power_w * nadir * math.pow(math.cos(min(rx.half_fov_rad, 1.5)), lamp.order + rx.order + 2.0)
@@ -45,14 +46,14 @@ def rim_amplitude(lamp: Lamp, rx: Receiver, depth: float) -> float:
 
 @dataclass(slots=True, eq=False)
 class Catalogue:
-    """Lamps by number and by code.
+    """Lamps by ID and by code.
 
     Attributes:
-        by_id, by_code: the lamps. surveyed: numbers of those that the survey names. rows: by number, for the kernels.
-        rims: by number, what each gives at the very edge of view of a level receiver, A.
-        heard: by number, when each that the survey does not name was last heard, longest ago first.
-        told: by number, the frame and code last learned, the lamp they were of, and whether the survey says otherwise.
-        doubts: by numbers of lamps, what they do not tell together (`collinear_lamps.doubt`).
+        by_id, by_code: the lamps. surveyed: IDs of those in the survey. rows: by ID, for the kernels.
+        rims: by ID, RSS at the very edge of the field of view of a level receiver, A.
+        heard: by ID, instant of the last reception of each lamp outside the survey, oldest first.
+        told: by ID, the frame and code last learned, its lamp, and whether the survey disagrees.
+        doubts: by set of IDs, extra covariance of collinear lamps (`collinear_lamps.doubt`).
     """
 
     depth: float
@@ -67,7 +68,7 @@ class Catalogue:
     doubts: dict[frozenset[int], Array] = field(default_factory=dict)
 
     def add(self, lamp: Lamp) -> None:
-        """Take a lamp in; one of the same number is replaced."""
+        """Add a lamp; one of the same ID is replaced."""
         self.doubts.clear()
         old = self.by_id.get(lamp.lamp_id)
         if old is not None:
@@ -78,13 +79,13 @@ class Catalogue:
         self.rims[lamp.lamp_id] = rim_amplitude(lamp, self.receiver, self.depth)
 
     def touch(self, lamp_id: int, t_mono: float) -> None:
-        """Note that a lamp was heard."""
+        """Record the reception of a lamp."""
         if lamp_id not in self.surveyed:
             self.heard.pop(lamp_id, None)
             self.heard[lamp_id] = t_mono
 
     def drop(self, lamp_id: int) -> None:
-        """Forget a lamp that the survey does not name."""
+        """Remove a lamp outside the survey."""
         self.doubts.clear()
         lamp = self.by_id.pop(lamp_id)
         self.by_code[lamp.code].remove(lamp)
@@ -92,7 +93,7 @@ class Catalogue:
         self.told.pop(lamp_id, None)
 
     def learn(self, frame: LampFrame, code: int, t_mono: float) -> tuple[Lamp, bool]:
-        """The lamp that says this of itself, and whether the survey (which wins) knows it otherwise."""
+        """Lamp of a data frame, and whether the survey (which takes precedence) disagrees with the frame."""
         known, told = self.by_id.get(frame.lamp_id), self.told.get(frame.lamp_id)
         if told is not None and told[0] is frame and told[1] == code and told[2] is known:  # as in the block before
             self.touch(frame.lamp_id, t_mono)
@@ -111,10 +112,10 @@ class Catalogue:
 
 
 def catalogue_of(survey: Survey) -> Catalogue:
-    """The survey's lamps.
+    """Catalogue of the survey's lamps.
 
     Raises:
-        ValueError: two lamps have one number.
+        ValueError: two lamps have the same ID.
     """
     catalogue = Catalogue(survey.depth, survey.receiver)
     for lamp in survey.lamps:

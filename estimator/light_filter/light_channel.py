@@ -1,4 +1,4 @@
-"""The light half of a step: the decoder and the `lights` filter of one photodiode, loaded only where there is one."""
+"""Light channel of one photodiode: decoder and light filter, loaded only where there is a photodiode."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from estimator.result import LightsResult
 
 @dataclass(frozen=True, slots=True)
 class LightsSetup:
-    """A photodiode and what it looks at.
+    """Configuration of a photodiode and its lamps.
 
     Attributes:
         survey: the lamps and the receiver; without lamps in it, they have to describe themselves.
         profile: air interface and front end.
         clock_ppm: stored error of the sample clock, good to 200 ppm; None: not known yet.
-        residuals: what the survey does not explain, place by place, learned with this survey; None: no such map.
+        residuals: residual map, learned with this survey; None: no such map.
     """
 
     survey: Survey = field(default_factory=Survey)
@@ -41,7 +41,13 @@ class LightsSetup:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Asked:
-    """What an epoch has said of a pose, and whether that was with the pose compared with the `lights` filter's."""
+    """Consistency of an epoch with a pose.
+
+    Attributes:
+        epoch, T_map_base: the epoch and the pose.
+        compared: whether the pose was compared with that of the light filter.
+        misplaced: whether the epoch is inconsistent with the pose.
+    """
 
     epoch: LightEpoch
     T_map_base: Array
@@ -50,18 +56,22 @@ class Asked:
 
 
 class LightChannel:
-    """What is known from light, without a place by the laser.
+    """Decoder, light filter and latest results of one photodiode; independent of the lidar's position.
 
     Attributes:
         setup: as given. decoder: of the photodiode's blocks. filter: see estimator/light_filter/light_filter.py.
-        result: after the latest
-            epoch. epoch: that epoch, None before the first. glimpse: places at which an epoch fits by itself. guided:
-            instant and pose (odom frame) of the latest scan, if its match may tell how the robot moves; see `guide`.
-        asked: what `light_evidence.misplaced` was asked last.
+        result: after the latest epoch. epoch: that epoch, None before the first.
+        glimpse: single-epoch fix: an epoch and the positions at which it fits by itself.
+        guided: instant and pose (odom frame) of the latest scan, if its match can serve as odometry; see `guide`.
+        asked: last result of `light_evidence.misplaced`.
     """
 
     def __init__(self, setup: LightsSetup) -> None:
-        """Nothing seen yet; raises ValueError for a stored clock out of range or an impossible survey."""
+        """Channel without any light yet.
+
+        Raises:
+            ValueError: a stored clock out of range or an impossible survey.
+        """
         self.setup = setup
         hung = {lamp.code for lamp in setup.survey.lamps}
         self.decoder = decoder.new_decoder(setup.profile, setup.clock_ppm, hung)
@@ -76,40 +86,40 @@ class LightChannel:
         self._spared = 0
 
     def predict(self, record: Record) -> None:
-        """Move the `lights` filter with the robot, by what wheels and gyro say."""
+        """Predict the light filter with odometry or gyro; other records are ignored."""
         if isinstance(record, Odometry | Imu):
             light_filter.predict(self.filter, record)
 
     @property
     def has_motion(self) -> bool:
-        """Whether wheels or matches give the motion to the light filter."""
+        """Whether wheels or scan matches give odometry to the light filter."""
         return self.filter.course.wheels
 
     @property
     def on_wheels(self) -> bool:
-        """Whether it is wheels that give it."""
+        """Whether that odometry comes from wheels."""
         return self.filter.course.wheels and not self.filter.course.matched
 
     def move(self, record: Odometry, velocity: Array) -> None:
-        """Where no wheels tell how the robot moves: move the `lights` filter by what matches say of it."""
+        """Predict the light filter with lidar odometry, where there are no wheels."""
         light_filter.move(self.filter, record, velocity)
 
     def left_alone(self) -> None:
-        """Matches do not tell that any more."""
+        """End the lidar odometry."""
         light_filter.left_alone(self.filter)
 
     def take(self, record: SampleBlock | LightEpoch) -> LightsResult:
-        """Decode a block, if it is one, and take the epoch into the filter."""
+        """Decode a block, or accept a decoded epoch, and update the filter."""
         self._decoded = isinstance(record, SampleBlock)
         self.epoch = decoder.decode(self.decoder, record) if isinstance(record, SampleBlock) else record
         self.result = light_filter.update(self.filter, self.epoch)
         return self.result
 
     def look_on(self, codes: int) -> None:
-        """Go on looking for lamps that are not followed yet, as far as this cycle can afford.
+        """Search for further lamps with the effort of ``codes`` codes.
 
-        Where only every other cycle brings a block, the one that has decoded it leaves the search, and the effort that
-        it was allowed, to the next: a lamp is found before the next block all the same, and no cycle does both.
+        If only every other cycle brings a block, the cycle that decoded it postpones search and effort to the next.
+        A lamp is still found before the next block, and no cycle does both.
         """
         busy = self._decoded and not self._decoded_before and len(self.decoder.tracks.slots) > 0
         self._decoded_before, self._decoded = self._decoded, False
@@ -120,25 +130,25 @@ class LightChannel:
         decoder.search(self.decoder, codes + spared)
 
     def place(self, T_map_base: Array, covariance: Array) -> None:
-        """Somebody says where the robot is."""
+        """Set the pose of the robot (operator pose), with its covariance."""
         light_filter.place(self.filter, T_map_base, covariance)
 
     def reset(self) -> None:
-        """Forget the place and what was learned of the lamps."""
+        """Clear the pose and everything learned about the lamps."""
         light_filter.reset(self.filter)
 
 
 def silent(light: LightChannel) -> bool:
-    """Whether there is no usable epoch of now."""
+    """Whether there is no recent usable epoch."""
     epoch = light.epoch
     return epoch is None or light.filter.course.t_mono - epoch.t_end > SILENT_S or bool(epoch.block & UNUSABLE)
 
 
 def too_strong_at(light: LightChannel | None, T_map_base: Array) -> list[bool]:
-    """Of each lamp that is received now, whether it is stronger than it can be near a pose (x, y, yaw; map frame).
+    """For each received lamp, whether its RSS is larger than possible near a pose (x, y, yaw; map frame).
 
-    Reads the latest epoch alone, neither the filter, which wheels can lead astray, nor the heading, of which strengths
-    know nothing. Of lamps of one code the nearest counts. Empty without a usable epoch.
+    It reads the latest epoch only. The filter may have diverged with wrong odometry, and RSS does not depend on the
+    heading. Of lamps of one code the nearest counts. Empty without a usable epoch.
     """
     if light is None or silent(light):
         return []

@@ -1,10 +1,11 @@
-"""The `lights` filter: odometry and lamps, no place by laser; pose, heading, and what lamps and sensors are off by.
+"""Light filter: EKF of odometry and links for pose, lamp gains and sensor errors (Eq. 5-7).
 
-    predict -> (start) -> name the lamps -> linearise -> gate -> absorb -> decide -> result
+    predict -> (start) -> associate links -> linearise -> gate -> update -> decide -> result
 
-It is the independent witness beside the laser and gives the paper's T_1 and virtual consistent components. Equations
-are in lambertian.py (1, 2, 7), state_vector.py and measurement_update.py (5-7); docs/lights.md leads from one to the
-other.
+It never uses the lidar's position. As an independent solution it gives the paper's T_1 and virtual consistent
+components. Equations
+are in lambertian.py (1, 2, 7), state_vector.py and measurement_update.py (5-7). docs/lights.md links equations and
+code.
 """
 
 from __future__ import annotations
@@ -46,31 +47,32 @@ __all__ = [
 ]
 
 HELD_S = 1.0
-"""After so long without a usable link the pose is said to be held."""
+"""Time (s) without a used link after which the pose is predicted only (`Fix.HELD`)."""
 LOST_S = 2.0
 LOST_SHARE = 0.5
-"""When more than this share of the links contradicts for so long, another place is looked for."""
+"""A new start is tried if more than this share of the links is inconsistent for `LOST_S` (s)."""
 ODD_S, ODD_SHARE = 0.15, 0.4
-"""When two links, and more than this share, are stronger than they can be for so long, the place is not believed."""
+"""The pose is rejected if two links, and more than this share, are stronger than possible for `ODD_S` (s)."""
 PROOF_M = 3.0
-"""Way without contradiction after which a place found anew is believed."""
+"""Path length (m) without inconsistency that confirms a new pose."""
 DRIFTED_M = 0.7
-"""A place less certain than that is not corrected but looked for anew: the equations are too bent there."""
+"""Position sigma (m) above which the filter restarts instead of updating: the model is too nonlinear there."""
 ANEW_M = 0.02
-"""Way after which strengths say something new of the heading. Those of a robot that stands, or turns on the spot, say
-again what they have said: it sways, and errors of a percent would rule out the right heading within a second. Without
-wheels only what is faster than a crawl counts as way, and that is new."""
+"""Path length (m) over which RSS brings new information about the heading. A robot at rest, or turning on the spot,
+repeats its measurements. It sways, and errors of a percent would reject the right heading within a second. Without
+odometry only motion faster than a crawl counts as path, and that is new information.
+"""
 
 
 def new_lights(
     survey: Survey, settings: LightsSettings | None = None, corrections: Corrections | None = None
 ) -> Lights:
-    """A filter that has seen nothing yet.
+    """Light filter without any light yet.
 
     Args:
         survey: lamps and receiver; without lamps in it, they have to describe themselves.
         settings: one set for every building.
-        corrections: a residual map of this building, or None.
+        corrections: residual map of this building, or None.
 
     Raises:
         ValueError: the survey is impossible.
@@ -79,7 +81,7 @@ def new_lights(
 
 
 def predict(lights: Lights, record: Odometry | Imu) -> None:
-    """Move by odometry or gyro; a reading that is no number, or comes from the past, is passed over."""
+    """Predict with odometry or gyro; a reading that is not finite, or is out of order, is ignored."""
     if not (math.isfinite(record.t_begin) and math.isfinite(record.t_end)):
         return
     if isinstance(record, Odometry):
@@ -89,12 +91,12 @@ def predict(lights: Lights, record: Odometry | Imu) -> None:
 
 
 def move(lights: Lights, record: Odometry, velocity: Array) -> None:
-    """Move as the laser has, where no wheels tell it; not while the lamps in use are a row.
+    """Predict with lidar odometry, where there are no wheels; not while the lamps in use are collinear.
 
     Args:
-        lights: all of the filter.
-        record: the way from the scan before to the latest one.
-        velocity: (v_x, v_y, yaw rate) at that.
+        lights: state of the filter.
+        record: motion between the last two scans.
+        velocity: (v_x, v_y, yaw rate) at its end.
     """
     if in_a_row(lights, record.t_end):
         left_alone(lights)
@@ -103,34 +105,34 @@ def move(lights: Lights, record: Odometry, velocity: Array) -> None:
 
 
 def left_alone(lights: Lights) -> None:
-    """The laser does not tell any more how the robot moves: from now on its speeds are guessed at."""
+    """End the lidar odometry: from now on the velocity is estimated."""
     if lights.course.wheels and lights.course.matched:
         motion_update.release(lights)
 
 
 def in_a_row(lights: Lights, t_mono: float) -> bool:
-    """Whether the lamps in use have been one row for long enough to count as such.
+    """Whether the lamps in use have been collinear long enough for lidar odometry to be harmful.
 
-    What a row tells of the distance from it, and of the heading, is the same mistake in every epoch: who also knows the
-    way and the turn to a hair soon believes it. Lamps that have gone out tell nothing. Who turns on the spot knows the
-    place by the lamps before, and needs to be told of the turn.
+    The distance from the line and the heading have the same error in every epoch. With precise odometry it would soon
+    seem certain. Lamps that are no longer received do not count. A robot that turns on the spot still has its position
+    from the earlier lamps, and needs the measured turn.
     """
     under = lights.under
     return under.lasts(t_mono) and under.far >= collinear_lamps.LASTING_M and t_mono - lights.t_used < HELD_S
 
 
 def carry_to(lights: Lights, t_mono: float) -> None:
-    """Bring the pose to an instant at the present velocity; an instant in the past changes nothing."""
+    """Extrapolate the pose to an instant at the present velocity; an earlier instant changes nothing."""
     if math.isfinite(t_mono):
         motion_update.carry_to(lights, t_mono)
 
 
 def lean(lights: Lights, slope_x: float, slope_y: float) -> None:
-    """How the robot leans now, as an IMU tells by gravity, beyond how it stood at calibration.
+    """Set the present tilt of the robot, measured by an IMU from gravity, relative to that at calibration.
 
     Args:
-        lights: all of the filter.
-        slope_x: of the receiver's axis in base_link, as in `lamps.Receiver`.
+        lights: state of the filter.
+        slope_x: of the receiver's axis in base_link, as in `survey.Receiver`.
         slope_y: the same, to the left.
     """
     if math.isfinite(slope_x) and math.isfinite(slope_y):
@@ -138,10 +140,10 @@ def lean(lights: Lights, slope_x: float, slope_y: float) -> None:
 
 
 def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
-    """Somebody says where the robot is: one hypothesis there, what is known of gains and sensors is kept.
+    """Set the pose (operator pose): a single hypothesis there; gains and sensor states are kept.
 
     Args:
-        lights: all of the filter.
+        lights: state of the filter.
         T_map_base: (x, y, yaw).
         covariance: 3x3; m^2, rad^2.
     """
@@ -156,7 +158,7 @@ def place(lights: Lights, T_map_base: Array, covariance: Array) -> None:
 
 
 def reset(lights: Lights) -> None:
-    """Forget the place and everything learned about lamps; those that described themselves stay known."""
+    """Clear the pose and everything learned about lamps; lamps that described themselves stay in the catalogue."""
     lights.tracks, lights.gains, lights.absent, lights.before = [], {}, {}, None
     lights.recalled, lights.bent = {}, Bent()
     lights.t_lost, lights.t_odd, lights.under, lights.lost, lights.result = (
@@ -169,10 +171,10 @@ def reset(lights: Lights) -> None:
 
 
 def update(lights: Lights, epoch: LightEpoch) -> LightsResult:
-    """Take an epoch of light in, on time or late (up to a second), and say what is known after it.
+    """Update with an epoch of light, on time or late (up to a second), and return the result.
 
     Args:
-        lights: all of the filter.
+        lights: state of the filter.
         epoch: decoded light. One without a usable block brings no links.
     """
     middle = 0.5 * (epoch.t_begin + epoch.t_end)
@@ -202,7 +204,7 @@ def update(lights: Lights, epoch: LightEpoch) -> LightsResult:
 
 
 def result(lights: Lights) -> LightsResult:
-    """What is known now: the latest links, the pose carried on since."""
+    """Present result: the latest links, with the pose predicted since."""
     if lights.result is None:
         return describe(lights, [], None)
     fresh = describe(lights, list(lights.result.links), None)
@@ -211,7 +213,7 @@ def result(lights: Lights) -> LightsResult:
 
 
 def look_around(lights: Lights, epoch: LightEpoch) -> None:
-    """Start where there is no hypothesis; start again where all have become too vague."""
+    """Start where there is no hypothesis; restart where the covariance of all is too large."""
     yaws, sigma = headings(lights.settings.headings)
     if lights.tracks:
         if min(float(track.P[0, 0] + track.P[1, 1]) for track in lights.tracks) < DRIFTED_M**2:
@@ -229,18 +231,18 @@ def look_around(lights: Lights, epoch: LightEpoch) -> None:
 
 
 def fits_prior(track: Track, place: Place) -> bool:
-    """Whether a place lies within four sigmas of where a hypothesis takes the robot to be."""
+    """Whether a position lies within four sigmas of a hypothesis."""
     spread = math.sqrt(float(track.P[0, 0] + track.P[1, 1])) + 0.5
     return math.hypot(place.x - float(track.x[0]), place.y - float(track.x[1])) < 4.0 * spread
 
 
 def keep_gains(lights: Lights) -> None:
-    """Remember the lamps' gains beyond the hypothesis that learned them, if it was worth believing."""
+    """Store the lamp gains of the hypothesis for later ones, if its pose is certain."""
     lights.gains.update(fresh_gains(lights))
 
 
 def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
-    """The epoch's links into every hypothesis; returns how the likeliest one sees them."""
+    """Update every hypothesis with the links of an epoch; returns the links as the likeliest one sees them."""
     back = motion_update.back_to(lights, middle)
     way, dt = lights.course.way - lights.way_epoch, middle - lights.t_epoch
     lights.way_epoch = lights.course.way
@@ -248,7 +250,7 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
     views: list[tuple[Track, list[Sight]]] = []
     likeliest = lights.tracks[:1]
     for track in lights.tracks:
-        if len(lights.tracks) > 1:  # afterwards the heading is known, and robots do reverse
+        if len(lights.tracks) > 1:  # with one left the heading is known, and robots do reverse
             motion_update.face_forward(lights, track)
         age(lights, track, way, dt)
         if len(lights.tracks) == 1 and lights.result is not None:
@@ -271,7 +273,10 @@ def take_in(lights: Lights, epoch: LightEpoch, middle: float) -> list[Sight]:
 
 
 def age(lights: Lights, track: Track, way: float, dt: float) -> None:
-    """What was wrong with the model a while ago is something else here; gains wander; so do sensor errors."""
+    """Process noise and decay of the slow states over a path length (m) and time (s).
+
+    Model errors decorrelate; gains, diffuse floor and sensor errors wander.
+    """
     model, n = lights.settings.model, track.n
     dt = min(max(dt, 0.0), 1e6) if math.isfinite(dt) else 0.0
     keep, grow = np.ones(n), np.zeros(n)
@@ -285,7 +290,7 @@ def age(lights: Lights, track: Track, way: float, dt: float) -> None:
 
 
 def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array, news: float) -> float:
-    """One hypothesis takes the links in; returns the ln of their likelihood under it."""
+    """Update one hypothesis with the links; returns ln of their likelihood."""
     kept, links = table(lights, track, seen)
     if not kept:
         return 0.0
@@ -297,7 +302,7 @@ def absorb(lights: Lights, track: Track, seen: list[Sight], view: Array, news: f
 
 
 def gain(before: tuple[Array, Array], track: Track) -> tuple[Array, Array]:
-    """Information that links added to the pose, and the correction they made; only the positive part of the former."""
+    """Information that links added to the pose (positive part only), and the correction they made."""
     x, P = before
     more = invert3(np.ascontiguousarray(track.P[:3, :3])) - invert3(np.ascontiguousarray(P))
     step = track.x[:3] - x
@@ -306,7 +311,7 @@ def gain(before: tuple[Array, Array], track: Track) -> tuple[Array, Array]:
 
 
 def follow_up(lights: Lights, epoch: LightEpoch, seen: list[Sight]) -> None:
-    """Note what was used; when most links contradict for long, look for another place that explains them better."""
+    """Record the used links; restart at a better position when most links are inconsistent for long."""
     if len(lights.tracks) != 1:
         return
     states = [sight.state for sight in seen]
@@ -341,7 +346,10 @@ NOTHING_GAINED = (np.zeros((3, 3)), np.zeros(3))
 def describe(
     lights: Lights, links: list[Link], epoch: LightEpoch | None, news: tuple[Array, Array] = NOTHING_GAINED
 ) -> LightsResult:
-    """Put the state into words; ``news``: the outcome of :func:`gain`, which a place that is lost does not have."""
+    """Assemble the result of the present state.
+
+    ``news``: information gain and correction of :func:`gain`; not reported while the pose is lost.
+    """
     pose, P, floor = np.zeros(3), np.zeros((3, 3)), 0.0
     if lights.tracks:
         pose, P = mixture(lights.tracks)
@@ -370,7 +378,7 @@ def describe(
 
 
 def fix_of(lights: Lights, P: Array) -> Fix:
-    """How far the position has come."""
+    """Status of the position estimate."""
     if not lights.tracks:
         return Fix.NONE
     spread = math.sqrt(max(float(P[0, 0] + P[1, 1]), 0.0))

@@ -1,4 +1,4 @@
-"""Data association: which lamp each link of an epoch comes from, and which lamps are missing or too strong."""
+"""Data association of links: the lamp of each link, missing lamps, and lamps stronger than possible."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from estimator.numerics.arrays import Array
 from estimator.result import Fix, Link, LinkState
 
 ACCEPTED, FAINT, TWIN, UNSURVEYED = LinkState.ACCEPTED, LinkState.FAINT, LinkState.TWIN, LinkState.UNSURVEYED
-FAINT_FLAG, TWIN_FLAG = int(LinkFlag.FAINT), int(LinkFlag.TWIN)  # an enum's lookups would be half of an update
+FAINT_FLAG, TWIN_FLAG = int(LinkFlag.FAINT), int(LinkFlag.TWIN)  # enum lookups would be half the time of an update
 
 TWIN_SHARE = 0.1
-"""A second lamp of the same code adds to a link when it would be received at this share of the first or more."""
+"""Relative RSS from which a second lamp of the same code contributes to a link."""
 NO_LIGHT_A = 1e-15
-"""A strength below that is rounding: one electron in a block is more."""
+"""RSS (A) below which a value is rounding: one electron in a block is more."""
 ABSENT_S, ABSENT_M = 5.0, 1.0
-"""A lamp not received for so long and over so much way is called missing; people in the way move on."""
+"""A lamp is missing if not received for `ABSENT_S` (s) and over this path length (m); people in the way move on."""
 WELL_INSIDE = 0.7
-"""Share of the field of view's reach within which a lamp should be received."""
+"""Share of the radius of the field of view within which a lamp should be received."""
 NEARER_M: Final = 1.0
+"""Margin of the position (m) in the test for too strong lamps."""
 STRONGER: Final = 2.0
-"""A lamp that is received so many times stronger than it can be within the former of a place is not received there."""
+"""Factor over the largest possible RSS within `NEARER_M` of a position from which a lamp is not received there."""
 
 
 @dataclass(slots=True, eq=False)
 class Sight:
-    """One link of an epoch as a hypothesis sees it; the fields are those of `result.Link`."""
+    """One link of an epoch as associated by a hypothesis; the fields are those of `result.Link`."""
 
     code: int
     amplitude: float
@@ -44,7 +45,7 @@ class Sight:
     sigma: float | None = None
 
     def link(self, learned: Learned) -> Link:
-        """As others are told."""
+        """The published link; ``learned``: gains of the hypothesis."""
         known = self.lamp is not None and self.state is not TWIN
         link_id = self.lamp.lamp_id if self.lamp is not None and known else None
         gain, spread = learned.gain(self.slot)
@@ -54,17 +55,17 @@ class Sight:
 
 
 class Learned:
-    """What a hypothesis has learned of the lamps in its slots; None: there is no hypothesis."""
+    """Lamp gains of a hypothesis; ``track`` None: no hypothesis."""
 
     def __init__(self, track: Track | None) -> None:
-        """Take it out of the arrays at once: one number at a time costs as much as all of them."""
+        """Convert the arrays to lists at once: reading one number costs as much as reading all."""
         self._x: list[float] = []
-        if track is not None:  # with slots that are not in use: it may be younger than the sights
+        if track is not None:  # includes unused slots: the hypothesis may be newer than the sights
             self._x = track.x.tolist()
             self._variance, self._common = track.P.diagonal().tolist(), track.P[state_vector.COMMON].tolist()
 
     def gain(self, slot: int) -> tuple[float, float]:
-        """Of the lamp in a slot (-1: none), common part included: ln gain and its variance."""
+        """Gain (ln) of the lamp in a slot (-1: none), common gain included, and its variance."""
         if slot < 0 or not self._x:
             return 0.0, 0.0
         at = state_vector.FIRST + state_vector.OWN * slot
@@ -73,7 +74,7 @@ class Learned:
 
 
 def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]:
-    """The links of an epoch with the lamps they come from if the receiver is near a place, strongest first."""
+    """Links of an epoch, each with its lamp for a receiver near (x, y) in m, strongest first."""
     rows = zip(
         epoch.ids.tolist(),
         epoch.amplitude.tolist(),
@@ -108,7 +109,7 @@ def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]
 
 
 def nearest(lights: Lights, code: int, x: float, y: float) -> tuple[Lamp | None, bool]:
-    """The lamp of a code nearest to a place, and whether it alone can be what is received there."""
+    """Lamp of a code nearest to a position, and whether the link can come from it alone."""
     lamps = lights.catalogue.candidates(code)
     if len(lamps) < 2:
         return (lamps[0], True) if lamps else (None, True)
@@ -118,7 +119,7 @@ def nearest(lights: Lights, code: int, x: float, y: float) -> tuple[Lamp | None,
 
 
 def below(lights: Lights, lamp: Lamp, x: float, y: float) -> float:
-    """Roughly how strong a lamp is at a place, level and without field of view: enough to rank lamps by."""
+    """Approximate RSS of a lamp at a position, level and without field of view; only ranks lamps."""
     receiver = lights.survey.receiver
     h2 = max(lamp.z - receiver.z, 0.1) ** 2
     d2 = h2 + (lamp.x - x) ** 2 + (lamp.y - y) ** 2
@@ -127,7 +128,7 @@ def below(lights: Lights, lamp: Lamp, x: float, y: float) -> float:
 
 
 def absent(lights: Lights, links: list[Link], pose: Array, fix: Fix) -> list[Link]:
-    """The links, with one of amplitude 0 for every surveyed lamp that is missing; judged only in a good place."""
+    """The links, with an entry of RSS 0 for every missing surveyed lamp; tested only with `Fix.GOOD`."""
     if fix is not Fix.GOOD:
         return links
     now, way, x, y = lights.course.t_mono, lights.course.way, float(pose[0]), float(pose[1])
@@ -151,7 +152,7 @@ def absent(lights: Lights, links: list[Link], pose: Array, fix: Fix) -> list[Lin
 
 
 def strong_at(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[bool]:
-    """Of each lamp of an epoch, whether it is stronger than it can be about a place of the receiver."""
+    """For each lamp of an epoch, whether it is stronger than possible near a position of the receiver (m)."""
     return [
         too_strong(lights, sight.lamp, sight.amplitude, x, y)
         for sight in sights(lights, epoch, x, y)
@@ -160,9 +161,9 @@ def strong_at(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[boo
 
 
 def too_strong(lights: Lights, lamp: Lamp, amplitude: float, x: float, y: float) -> bool:
-    """Whether a lamp is received straight, and stronger than it can be near a place of the receiver.
+    """Whether a lamp is received in line of sight, and stronger than possible near a position of the receiver (m).
 
-    However dim it was known last, it may shine as surveyed: something may have stood in its light while it was learned.
+    A learned gain below the survey is not applied. An obstacle may have dimmed the lamp while its gain was learned.
     """
     rx = lights.survey.receiver
     h = max(lamp.z - rx.z, 0.1)

@@ -1,4 +1,4 @@
-"""Gating of links: how much each differs from its lamp, and whether it is used or paused."""
+"""NIS gating of links against one hypothesis: accepted, occluded, rejected or paused; moved and aged lamps."""
 
 from __future__ import annotations
 
@@ -18,34 +18,37 @@ ACCEPTED, OCCLUDED = LinkState.ACCEPTED, LinkState.OCCLUDED
 REJECTED, RIM = LinkState.REJECTED, LinkState.RIM
 
 DIFFUSE = 0.6
-"""A strength below this share of what the lamp gives at the edge of view has not come straight."""
+"""Share of a lamp's RSS at the edge of view below which a link is not line of sight."""
 RELEARN_S, RELEARN_M = 15.0, 3.0
-"""A link that contradicts so long and far, and always by the same factor, is a lamp of another power: learn it anew."""
+"""The gain of a lamp is learned again if its links are off by a constant factor for long: `RELEARN_S` (s) and this path
+length (m). Its power has then changed.
+"""
 HIDDEN = 1.4
-"""A lamp that has lost three quarters (ln) is hidden, not old: it is not learned as one of another power."""
+"""A loss (ln) above which a lamp is hidden, not aged (three quarters of its light): its gain is not learned again."""
 STEADY = 0.12
-"""Spread of its ln residual up to which a contradiction is called steady."""
+"""Spread of the ln residuals up to which the factor counts as constant."""
 TOO_STRONG = 3.0
-"""Times what a lamp gives at the edge of view, which none near that edge can give."""
+"""Factor over a lamp's RSS at the edge of view that no lamp near that edge reaches."""
 MOVED_LEANS = 3.0
-"""So many sigmas of lean are what a lamp may have; more is a lamp in another place."""
+"""Largest plausible tilt of a lamp, in sigmas; a larger one indicates another position."""
 FIRST_ERROR = 5.0
-"""Variance of a model error at first sight: later, gain and lean have taken up what always is the same in it."""
+"""Initial variance of a model error; later, gain and tilt have absorbed its constant part."""
 STRIKES = 2
-"""So often a lamp is learned anew; one that contradicts again stands somewhere else."""
+"""Number of times a lamp's gain is learned again; if it is then inconsistent, the lamp is elsewhere."""
 FADE_M = 100.0
-"""Way with a lamp that fits after which one time that it was learned anew is forgotten: lamps do age."""
+"""Path length (m) with a fitting lamp after which one such time no longer counts: lamps do age."""
 PAROLE_M, PAROLE = 5.0, 2.0
-"""A lamp called moved is used again when it has fitted so far, always within so many sigmas; every time that this is
-done, the next takes twice the way."""
+"""A moved lamp is used again after `PAROLE_M` (m) of links within this many sigmas. The path length doubles every
+time.
+"""
 STRIDE_M = 0.2
-"""Way between two epochs that counts at most: what was driven out of a lamp's sight says nothing of it."""
+"""Largest path length (m) counted between two epochs: driving out of a lamp's sight is no evidence about it."""
 FORGET_S, DESCRIBED = 3600.0, 1024
-"""A lamp known by its own word only is forgotten when unheard for so long, or as the longest unheard of so many."""
+"""A lamp outside the survey is removed if not received for `FORGET_S` (s), or as the oldest beyond this number."""
 
 
 def slot_of(lights: Lights, track: Track, lamp: Lamp, busy: set[int]) -> int | None:
-    """The slot of a lamp in a hypothesis; the longest unseen lamp makes room for a new one; None if none can."""
+    """Slot of a lamp in a hypothesis; a new lamp replaces the longest unseen one. None if all slots are busy."""
     slot = track.slots.get(lamp.lamp_id)
     if slot is None:
         if track.used < state_vector.SLOTS:
@@ -64,7 +67,7 @@ def slot_of(lights: Lights, track: Track, lamp: Lamp, busy: set[int]) -> int | N
 
 
 def vacate(lights: Lights, track: Track, slot: int) -> None:
-    """Remember what is known of the lamp in a slot and take it out."""
+    """Store gain and tilt of the lamp in a slot, and free the slot."""
     lamp_id = next(key for key, value in track.slots.items() if value == slot)
     at = state_vector.FIRST + state_vector.OWN * slot
     lights.gains[lamp_id] = track.x[at : at + 3].copy(), np.diag(track.P)[at : at + 3].copy()
@@ -72,14 +75,14 @@ def vacate(lights: Lights, track: Track, slot: int) -> None:
 
 
 def remembered(lights: Lights, lamp: Lamp) -> tuple[Array, Array]:
-    """Means and variances of a lamp's (ln gain, lean x, lean y) as known from before, else as surveyed."""
+    """Means and variances of a lamp's (ln gain, tilt x, tilt y): stored ones, else of the survey."""
     lean = lights.settings.model.lean
     new = np.zeros(3), np.array((lamp.sigma_ln**2, lean**2, lean**2))
     return lights.gains.get(lamp.lamp_id, new)
 
 
 def occupy(lights: Lights, track: Track, lamp: Lamp, slot: int) -> None:
-    """Give a lamp a slot, with what is known of its gain from before."""
+    """Assign a slot to a lamp, with its stored gain."""
     at = state_vector.FIRST + state_vector.OWN * slot
     mean, variance = remembered(lights, lamp)
     for j in range(state_vector.OWN):
@@ -90,7 +93,7 @@ def occupy(lights: Lights, track: Track, lamp: Lamp, slot: int) -> None:
 
 
 def table(lights: Lights, track: Track, seen: list[Sight]) -> tuple[list[Sight], Array]:
-    """The sights that can be compared with a hypothesis, and their rows for the kernels."""
+    """The sights with a slot in the hypothesis, and their rows for the kernels."""
     kept, busy = list[Sight](), set[int]()
     for sight in seen:
         if sight.lamp is None or sight.state is not ACCEPTED:
@@ -113,29 +116,30 @@ def table(lights: Lights, track: Track, seen: list[Sight]) -> tuple[list[Sight],
 
 
 def view_of(lights: Lights, back: Array) -> Array:
-    """What the kernels need besides state and links."""
+    """Receiver, pose at the epoch and model sigmas for the kernels."""
     model, rx = lights.settings.model, pack_receiver(lights.survey.receiver)
     rx[7:9] += lights.lean
     return np.concatenate([rx, back, (model.ln, model.floor, model.white, model.edge)])
 
 
 def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, news: float) -> float:
-    """Decide on every link; what is not to be used gets an infinite noise, what may be an outlier a larger one.
+    """Decide on every link; an unused link gets infinite noise, a possible outlier larger noise.
 
-    Gating waits until the place is known well; before, a deviation is held against the link only softly, because it
-    may as well be the place or a gain that is wrong. A lamp that something hides would pull at the place twenty times a
-    second, though, and a robot that stands would be led to where it fits: it only counts against the hypothesis. Nor
-    does any other deviation say something new while wheels say that it stands: exchanged lamps would lead it away.
+    Gating waits until the position is certain. Before, a deviation only raises the noise of the link: position or gain
+    may be wrong instead. An occluded lamp is an exception, because it would pull the position twenty times a second. A
+    robot at rest would drift to where the lamp fits. It therefore only lowers the likelihood of the hypothesis. Other
+    deviations
+    bring no new information while odometry reports rest: exchanged lamps would make the position diverge.
 
     Args:
-        lights: all of the filter.
+        lights: state of the filter.
         track: the hypothesis.
         kept: its links.
-        out: what `measurement_update.linearise` says of them, changed.
-        news: how much of an epoch is news by the way driven since the one before, 0 to 1.
+        out: `measurement_update.linearise` of them, changed.
+        news: share of new information in an epoch, by the path length since the last one, 0 to 1.
 
     Returns:
-        ln of the likelihood of the links that are left out.
+        ln of the likelihood of the links that are not used.
     """
     likelihood = 0.0
     half, rim = lights.survey.receiver.half_fov_rad, lights.settings.rim_rad
@@ -163,9 +167,9 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, news: flo
 
 
 def weak(lights: Lights, sight: Sight) -> bool:
-    """Whether a link is weaker than its lamp is anywhere in view, so that something hides it, wherever the receiver is.
+    """Whether a link is weaker than its lamp is anywhere in view, so that an obstacle must occlude it.
 
-    Without wheels nothing holds a wrong hypothesis but such links: there they go on pulling.
+    Without odometry it is always False: only such links constrain a wrong hypothesis there, so they stay in use.
     """
     if sight.lamp is None or not lights.course.wheels:
         return False
@@ -174,7 +178,7 @@ def weak(lights: Lights, sight: Sight) -> bool:
 
 
 def rim_of(lights: Lights, track: Track, sight: Sight) -> float:
-    """What this link's lamp would give at the edge of view, with its gain as learned, A."""
+    """RSS of this link's lamp at the edge of view, with its learned gain, A."""
     if sight.lamp is None:
         return math.inf
     gain = float(track.x[state_vector.COMMON] + track.x[state_vector.FIRST + state_vector.OWN * sight.slot])
@@ -182,15 +186,15 @@ def rim_of(lights: Lights, track: Track, sight: Sight) -> float:
 
 
 def settled(track: Track) -> bool:
-    """Whether the place is known well enough for a link that does not fit to be called wrong.
+    """Whether the position is certain enough to reject a link that does not fit.
 
-    What a lamp is received as depends on the place and hardly on the heading, which without wheels is never known well.
+    RSS depends on the position and hardly on the heading, which without odometry is never certain.
     """
     return bool(track.P[0, 0] + track.P[1, 1] < 0.2**2)
 
 
 def gate(lights: Lights, track: Track, sight: Sight) -> LinkState:
-    """One link's NIS gate, narrower downwards: things in the way only ever take light away."""
+    """NIS gate of one link, narrower downwards: obstacles only ever reduce the light."""
     settings, t, way = lights.settings, lights.course.t_mono, lights.course.way
     if sight.lamp is None or sight.residual is None or sight.sigma is None:
         return RIM
@@ -221,7 +225,7 @@ def gate(lights: Lights, track: Track, sight: Sight) -> LinkState:
 
 
 def parole(watch: Watch, fits: bool, step: float) -> None:
-    """Take back that a lamp was moved when it has fitted for long: nothing else would ever say so."""
+    """Revoke the moved state of a lamp that has fitted for long; no other evidence would revoke it."""
     watch.fitted = watch.fitted + step if fits else 0.0
     if watch.fitted > PAROLE_M * 2.0 ** min(watch.paroles, 10):
         watch.moved, watch.fitted, watch.t_run = False, 0.0, math.inf
@@ -241,7 +245,7 @@ def shorten(lights: Lights, kept: list[Sight], out: Array) -> None:
 
 
 def distrust(lights: Lights, track: Track) -> None:
-    """A lamp whose strengths can only be explained by a lean that no lamp has hangs elsewhere: it is not used again."""
+    """Mark lamps as moved whose estimated tilt is implausible; they are not used again."""
     limit, n = MOVED_LEANS * lights.settings.model.lean, track.n
     x, variance = track.x[:n].tolist(), track.P.diagonal()[:n].tolist()
     for lamp_id, slot in track.slots.items():
@@ -256,7 +260,7 @@ def distrust(lights: Lights, track: Track) -> None:
 
 
 def relearn(lights: Lights, track: Track) -> None:
-    """A lamp whose light has long been off by a constant factor is learned anew, unless that was tried before."""
+    """Learn the gain again of lamps whose RSS has long been off by a constant factor, up to `STRIKES` times."""
     for lamp_id, watch in track.watches.items():
         long = lights.course.t_mono - watch.t_run > RELEARN_S and lights.course.way - watch.way_run > RELEARN_M
         if not long or watch.strikes >= STRIKES or lamp_id not in track.slots:
@@ -275,7 +279,7 @@ def relearn(lights: Lights, track: Track) -> None:
 
 
 def forget(lights: Lights) -> None:
-    """Let go of lamps known by their own word only and long unheard; those in a slot stay."""
+    """Remove lamps outside the survey that have not been received for long; those in a slot stay."""
     heard, now = lights.catalogue.heard, lights.course.t_mono
     oldest = next(iter(heard.values()), now)
     if now - oldest <= FORGET_S and len(heard) <= DESCRIBED:

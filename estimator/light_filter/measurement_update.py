@@ -1,6 +1,6 @@
-"""Eq. 5-7: links against the state of the `lights` filter, compiled: what they differ by, and taking them in.
+"""EKF measurement update for links (Eq. 5-7), compiled: linearisation, gain, covariance.
 
-A link is compared as ln amplitude: gains are then additive, and its error is a share of it whatever its strength.
+A link is compared as ln RSS: gains are then additive, and its error is a share of it whatever its strength.
 """
 
 from __future__ import annotations
@@ -29,34 +29,37 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 WIDTH: Final = 12
-"""Elements of the state that one link depends on: pose; common gain, floor, lean, order; the four of its lamp."""
+"""State elements that one link depends on: pose; common gain, diffuse floor, tilt, order; the four of its lamp."""
 
 SLOT, LN, NOISE, SHIFT, SIGMA, SHIFT_X, SHIFT_Y, LINK_COLUMNS = range(8)
-"""Columns of a link: slot, ln of the amplitude, variance of that, ln correction by a residual map, sigma of the model
-there (negative: the general one), the correction's gradient (1/m)."""
+"""Columns of a link: slot, ln RSS, its variance, ln correction of the residual map, sigma of the model there (negative:
+the general one), gradient of the correction (1/m).
+"""
 
 RESIDUAL, SPREAD, WHITE, DIRECT, COS_BETA, TOTAL, SLOPES = range(7)
-"""Columns of what :func:`linearise` says of a link: ln(received / expected); its variance by the state alone; variance
-of the noise; direct part over the total; cosine of the angle to the axis; expected amplitude, A; then the WIDTH
-derivatives."""
+"""Columns of the result of :func:`linearise`: ln(received / expected); its variance by the state alone; variance of the
+noise; direct part over the total; cosine of the angle to the axis; expected RSS, A; then the WIDTH derivatives.
+"""
 OUT_COLUMNS: Final = SLOPES + WIDTH
 
 BACK: Final = RECEIVER_COLUMNS
-"""In a view: from here (x, y, yaw) of the pose at the epoch, seen from the state's pose."""
+"""Index in a view: (x, y, yaw) of the pose at the epoch, relative to the state's pose."""
 MODEL: Final = RECEIVER_COLUMNS + 3
-"""In a view: from here the sigmas of the model: ln, anywhere; share of the diffuse part; ln, anew at every epoch; ln at
-the edge of view."""
+"""Index in a view: sigmas of the model. In order: ln of any link, share of the diffuse part, ln per epoch, ln at the
+edge of view.
+"""
 VIEW_COLUMNS: Final = MODEL + 4
 
 LOG_2PI: Final = 1.8378770664093453
 SURPRISE_CAP: Final = 16.0
-"""A link's squared deviation counts no more than that in the likelihood of a hypothesis: one lamp covered by a shelf
-must not decide which way the robot looks."""
+"""Limit of a link's squared deviation in the likelihood of a hypothesis: one lamp covered by a shelf must not decide
+the heading.
+"""
 
 
 @kernel("i8(f8, i8)", inner=True)
 def element(slot: float, w: int) -> int:
-    """Where in the state the ``w``-th of the WIDTH elements of a link in a slot stands."""
+    """State index of the ``w``-th of the WIDTH elements of a link in a slot."""
     if w < 3:
         return w
     if w < 8:
@@ -66,15 +69,15 @@ def element(slot: float, w: int) -> int:
 
 @kernel("void(f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1])")
 def linearise(x: Array, P: Array, links: Array, lamps: Array, view: Array, out: Array) -> None:
-    """Compare links with what the state expects of them, without changing anything.
+    """Residual, variances and derivatives of links at a state; changes nothing else.
 
     Args:
         x: state.
         P: its covariance.
         links: (L, LINK_COLUMNS).
         lamps: (slots, 7), rows of `lambertian.pack_lamps`.
-        view: (VIEW_COLUMNS,) receiver, pose at the epoch seen from the state's, sigmas of the model.
-        out: (L, OUT_COLUMNS), filled.
+        view: (VIEW_COLUMNS,) receiver, pose at the epoch relative to the state's, sigmas of the model.
+        out: (L, OUT_COLUMNS) out.
     """
     rx, pose, J, said = view[:RECEIVER_COLUMNS].copy(), np.empty(3), np.empty(COLUMNS), np.empty(3)
     lamp = np.empty(LAMP_COLUMNS)
@@ -120,7 +123,7 @@ def linearise(x: Array, P: Array, links: Array, lamps: Array, view: Array, out: 
 
 @kernel("void(f8[:, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])", inner=True)
 def spread_out(P: Array, n: int, K: Array, b: Array, c: Array, out: Array) -> None:
-    """``P <- P + sum of K c' - b K'`` over the links that are used, a row at a time: it stays in the cache."""
+    """``P <- P + sum of K c' - b K'`` over the links in use, row by row to stay in the cache."""
     for j in range(n):
         for i in range(out.shape[0]):
             if out[i, WHITE] < np.inf:
@@ -134,18 +137,18 @@ def spread_out(P: Array, n: int, K: Array, b: Array, c: Array, out: Array) -> No
 
 @kernel("UniTuple(f8, 2)(f8[::1], f8[:, ::1], i8, f8[::1], f8[:, ::1], f8[:, ::1])")
 def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) -> tuple[float, float]:
-    """Take links in one after another: Kalman's gain, the covariance in Joseph's form.
+    """Sequential Kalman update with links, covariance in Joseph's form.
 
     Args:
         x: state, changed in place.
         P: its covariance, changed in place; stays symmetric and positive.
         n: elements in use.
-        around: the state at which the links were linearised; ``x`` itself at first, an earlier outcome when iterated.
+        around: linearisation point of the links; ``x`` itself at first, an earlier result when iterated.
         links: (L, LINK_COLUMNS).
-        out: (L, OUT_COLUMNS) of :func:`linearise`; a link whose WHITE is infinite is left out.
+        out: (L, OUT_COLUMNS) of :func:`linearise`; a link with infinite WHITE is not used.
 
     Returns:
-        ln of the likelihood of these links together, each one's surprise capped; their joint NIS, which is not.
+        ln of the likelihood of these links together, each squared deviation capped; their joint NIS, uncapped.
     """
     likelihood, nis, count = 0.0, 0.0, links.shape[0]
     at, A = np.empty((count, WIDTH), np.int64), np.zeros((count, n))
@@ -178,7 +181,7 @@ def absorb(x: Array, P: Array, n: int, around: Array, links: Array, out: Array) 
             b[i, j] = A[i, j] - K[i, j] * spread
             c[i, j] = noise * K[i, j] - A[i, j]
             x[j] += K[i, j] * nu
-        for m in range(i + 1, count):  # what this update changes for the links still to come
+        for m in range(i + 1, count):  # apply this update to the links still to come
             if out[m, WHITE] < np.inf:
                 up = down = 0.0
                 for w in range(WIDTH):

@@ -1,8 +1,8 @@
-"""How far lamps have to be taken for others than was expected, for their light to fit where the robot is said to be.
+"""Gain consistency monitor: squared normalised deviation of estimated lamp gains and tilts from their prior.
 
-Light that has come by way of a wall fits as well as any, with lamps that are unlikely, at a place that is wrong by
-several of its deviations; so does that of two lamps whose codes were exchanged, and, for a while, that of a lamp which
-goes out slowly. How much the place is doubted for it: `light_inflation`.
+A large value means that the pose is probably wrong. Light reflected by a wall fits a wrong pose, several sigmas off,
+with improbable lamps. So does the light of two lamps whose codes were exchanged. For a while, so does a lamp that
+fades out. `light_inflation` derives the inflation of the light pose.
 """
 
 from __future__ import annotations
@@ -12,26 +12,28 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 KEPT_M, KEPT_S = 0.7, 60.0
-"""Way and time over which it fades, by a factor of e, that lamps have been bent: those over which the error of the
-light model stays the same (docs/estimator.md). Lamps in use change from epoch to epoch, the place does not."""
+"""Path length (m) and time (s) over which a value fades by a factor of e. They are those over which the error of the
+light model stays the same (docs/estimator.md). Lamps in use change from epoch to epoch, the position does not.
+"""
 FOUND_M = 2.5
-"""Way in the use of a lamp over which what it is bent by becomes what is known of it, m."""
+"""Path length (m) with a lamp in use over which its deviation becomes its usual one."""
 EPOCH_M, EPOCH_S = 0.1, 1.0
-"""No epoch stands for more, m and s: what was received before the dark neither is found in it nor fades."""
+"""Limits of one epoch (m, s): before an interval without light, deviations are neither learned nor do they fade."""
 START_M = 2.0
-"""Way over which the place is looked for, m: what lamps are bent by meanwhile is not found, for a start that is half a
-metre off has found lamps that fit it before it has found its mistake."""
+"""Path length (m) after a start during which usual deviations are not learned. A start half a metre off finds lamp
+gains that fit it before it finds its error.
+"""
 USUAL, VARIES, FOUND_MOST = 1.0, 1.5, 4.0
-"""Up to the first lamps are bent where nothing is wrong; up to so many times what they have long been by; but however
-long, not up to more than the last, in the mean of the lamps: an earlier run or the survey is wrong by two deviations
-each then, or the place is."""
+"""Deviation that is usual if nothing is wrong; factor on the long-term deviation; largest long-term deviation allowed,
+in the mean of the lamps. Above it each lamp is off by two sigmas: an earlier run, the survey or the pose is wrong.
+"""
 WORST = 100.0
-"""What a lamp counts as at most, and what no number counts as."""
+"""Cap of the value of a lamp, also used for values that are not finite."""
 
 
 @dataclass(slots=True, eq=False)
 class Known:
-    """One lamp: ``found``: what it has long been bent by, deviations squared; ``way``: at which it was last used, m."""
+    """Usual deviation of one lamp: ``found``, squared deviations; ``way``: path length of its last use, m."""
 
     found: float
     way: float
@@ -39,13 +41,15 @@ class Known:
 
 @dataclass(slots=True, eq=False)
 class Bent:
-    """All lamps, since the place began to be looked for: a place that is wrong has found lamps that fit it alone.
+    """Gain consistency of all lamps since the start of the position search.
+
+    A wrong pose has found gains that fit it alone.
 
     Attributes:
-        now: how far those in use are bent, or were of late; deviations squared, mean of the lamps. Where the light
-            model holds it is 0.2 to 1.
-        found: have long been. lamps: by lamp ID.
-        begun: way at which a lamp was first used, m. t, way: when the last was, s and m.
+        now: present or recent value of the lamps in use; squared deviations, mean of the lamps. It is 0.2 to 1 where
+            the light model holds.
+        found: their long-term value. lamps: by lamp ID.
+        begun: path length of the first use, m. t, way: instant (s) and path length (m) of the last use.
     """
 
     now: float = 0.0
@@ -56,12 +60,12 @@ class Bent:
     lamps: dict[int, Known] = field(default_factory=dict)
 
     def take(self, squares: Mapping[int, float], t: float, way: float) -> None:
-        """Note what lamps in use are bent by.
+        """Update with the values of the lamps in use.
 
         Args:
             squares: by lamp ID, deviations squared; not empty.
             t: instant, s.
-            way: driven, m.
+            way: path length, m.
         """
         self.begun = min(self.begun, way)
         told = {lamp: min(square, WORST) if math.isfinite(square) else WORST for lamp, square in squares.items()}
@@ -73,18 +77,19 @@ class Bent:
         self.t, self.way = t, way
 
     def _find(self, lamp: int, square: float, way: float) -> float:
-        one = self.lamps.setdefault(lamp, Known(self.found, way))  # first what those beside it have been
+        """Update and return the long-term value of one lamp."""
+        one = self.lamps.setdefault(lamp, Known(self.found, way))  # initial value: that of the other lamps
         if way - self.begun > START_M:
             one.found += (square - one.found) * -math.expm1(-min(max(way - one.way, 0.0), EPOCH_M) / FOUND_M)
         one.way = way
         return one.found
 
     def elsewhere(self) -> None:
-        """The place is another, or in doubt: nothing has been found there yet. What was bent of late stays."""
+        """Clear the long-term values, because the pose is another or in doubt. The recent value stays."""
         self.lamps.clear()
         self.found, self.begun = 0.0, math.inf
 
     @property
     def anew(self) -> float:
-        """By how much lamps are bent more than they have long been, or than can be found, and more than is usual."""
+        """Excess of the present value over the long-term value (limited) and over the usual value."""
         return max(0.0, self.now - max(min(VARIES * self.found, FOUND_MOST), USUAL))

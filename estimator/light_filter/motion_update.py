@@ -1,8 +1,8 @@
-"""The prediction of the `lights` filter: wheels, gyro or constant velocity move every hypothesis alike.
+"""Time update of the light filter: odometry, gyro or constant velocity move every hypothesis alike.
 
-Odometry speaks up to its own stamp. When something newer comes in, the pose is carried ahead at the velocity, and the
-carry (``ahead``) is taken back as soon as odometry of the same stretch arrives. An epoch of light that is older than
-the pose is compared with where the robot stood then, by the dead-reckoned trail: no state is ever wound back.
+Odometry is valid up to its own stamp. When a newer record arrives, the pose is extrapolated at the velocity. The
+extrapolation (``ahead``) is removed when odometry of the same interval arrives. A late epoch of light is compared with
+the dead-reckoned pose at its instant: the state is never rewound.
 """
 
 from __future__ import annotations
@@ -19,31 +19,33 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 
 CARRY_S: Final = 0.5
-"""Odometry older than that is not missed for a moment; it has ended, and constant velocity takes over."""
+"""Age (s) of odometry after which it has ended, and constant velocity replaces it."""
 GYRO_FRESH_S: Final = 0.1
+"""Age (s) of the gyro after which it has ended."""
 UNSEEN: Final = 0.5
-"""m/s and rad/s of a robot that nobody watches."""
+"""Sigma of the speed (m/s, rad/s) of a robot without any sensor data."""
 REVERSE_M_S: Final = 0.1
+"""Backward speed (m/s) below which a robot is not taken to reverse."""
 TOLD_S: Final = 2.0
-"""So long after odometry, or matches, told the way a robot may be reversing as these have said."""
+"""Time (s) after the last odometry during which a reversing robot is accepted."""
 STILL: Final = 0.08
-"""m/s; without odometry a slower robot is taken to stand."""
+"""Speed (m/s) below which a robot without odometry is at rest."""
 AT_MOST: Final = (5.0, 5.0, 10.0)
-"""m/s, m/s and rad/s of any indoor robot. What is faster has moved so far, but not in the time that its stamps say."""
+"""Speed limits of any indoor robot: m/s, m/s and rad/s. Odometry above them has valid motion, but wrong stamps."""
 FASTEST: Final = 20.0
-"""m or rad within one record. More is not a motion but a counter that has jumped."""
+"""Largest motion (m or rad) of one record. A larger one is a counter that has jumped."""
 
 
 def on_odometry(lights: Lights, record: Odometry, velocity: Array | None = None) -> None:
-    """Move by what the wheels say, less what was carried ahead; turn by the gyro where that covers the stretch.
+    """Predict with odometry, less the earlier extrapolation; the gyro replaces the turn where it covers the interval.
 
-    What comes late, when light has already carried the pose beyond its stamp, is carried on to there again. The noise
-    is that of the way told: what the carry was wrong by says nothing of what wheels are.
+    Late odometry, which light has overtaken, is extrapolated to the present instant again. The noise is that of the
+    measured motion. The error of the extrapolation is not an error of the odometry.
 
     Args:
-        lights: all of them.
-        record: the way.
-        velocity: (v_x, v_y, yaw rate) by matches, where these tell the way in the place of wheels; else None.
+        lights: state of the filter.
+        record: the motion.
+        velocity: (v_x, v_y, yaw rate) of lidar odometry, which replaces wheels; None for wheels.
     """
     course, noise, matched = lights.course, lights.settings.motion, velocity is not None
     delta = np.array(record.delta, dtype=np.float64)
@@ -88,7 +90,7 @@ def on_odometry(lights: Lights, record: Odometry, velocity: Array | None = None)
 
 
 def gyro_until(lights: Lights, t_end: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """What the gyro has added up (rad, s) since the last odometry: until an instant, and later."""
+    """Gyro angle and time (rad, s) since the last odometry: until an instant, and after it."""
     course = lights.course
     later_s = min(max(course.t_gyro - t_end, 0.0), course.gyro_span)
     later = float(course.velocity[2]) * later_s, later_s
@@ -96,7 +98,7 @@ def gyro_until(lights: Lights, t_end: float) -> tuple[tuple[float, float], tuple
 
 
 def on_imu(lights: Lights, record: Imu) -> None:
-    """Turn by what the gyro says over the part of its interval that is still to come; move on at the velocity."""
+    """Turn by the gyro over the part of its interval that is still to come, and extrapolate the position."""
     course, noise = lights.course, lights.settings.motion
     dt = record.t_end - record.t_begin
     if not (0.0 < dt < CARRY_S and abs(record.dyaw) < FASTEST * dt):
@@ -111,7 +113,7 @@ def on_imu(lights: Lights, record: Imu) -> None:
 
 
 def carry_to(lights: Lights, t_mono: float) -> None:
-    """Bring the poses to an instant at the velocity; an instant in the past changes nothing."""
+    """Extrapolate the poses to an instant at the velocity; an earlier instant changes nothing."""
     course = lights.course
     if not t_mono > course.t_mono:
         return
@@ -128,16 +130,16 @@ def carry_to(lights: Lights, t_mono: float) -> None:
 
 
 def gyro(lights: Lights) -> bool:
-    """Whether a gyro is alive."""
+    """Whether the gyro is available."""
     return lights.course.t_mono - lights.course.t_gyro < GYRO_FRESH_S
 
 
 def glide(lights: Lights, t_mono: float, turn: float | None, spread: float) -> None:
-    """Move on to an instant: by the last odometry's speed while that is fresh, else by the speed in the state.
+    """Extrapolate to an instant: by the last odometry's speed while that is fresh, else by the speed in the state.
 
     Args:
-        lights: all of them.
-        t_mono: until when.
+        lights: state of the filter.
+        t_mono: end of the extrapolation, s.
         turn: rad by gyro or odometry; None: by the rate in the state.
         spread: rad per root second of error of that turn.
     """
@@ -166,7 +168,7 @@ def glide(lights: Lights, t_mono: float, turn: float | None, spread: float) -> N
 
 
 def move_all(lights: Lights, delta: Array, blame: Array, q: Array, t_mono: float) -> None:
-    """Move every hypothesis, and the dead-reckoned trail with the likeliest."""
+    """Move every hypothesis, and the dead-reckoned history with the likeliest."""
     course = lights.course
     made = delta
     for k, track in enumerate(lights.tracks):
@@ -175,7 +177,7 @@ def move_all(lights: Lights, delta: Array, blame: Array, q: Array, t_mono: float
         state_vector.move(track.x, track.P, track.n, delta, blame, q)
     course.T = se2.compose(course.T, made)
     way = math.hypot(made[0], made[1])
-    if course.matched and course.wheels:  # the noise of matches is no way
+    if course.matched and course.wheels:  # the noise of matches must not count as path length
         speed = math.hypot(course.velocity[0], course.velocity[1])
         way = speed * (t_mono - course.t_mono) if speed > STILL and math.isfinite(course.t_mono) else 0.0
     course.way += way if course.wheels else max(0.0, way - STILL * float(blame[0]))
@@ -184,7 +186,7 @@ def move_all(lights: Lights, delta: Array, blame: Array, q: Array, t_mono: float
 
 
 def drive(lights: Lights, dt: float) -> None:
-    """Constant velocity for a while: forward speed wanders, sideways speed dies out, a turn does not last."""
+    """Process noise of constant velocity: forward speed wanders, sideways speed and turn rate decay."""
     noise = lights.settings.motion
     for track in lights.tracks:
         keep, grow = np.ones(track.n), np.zeros(track.n)
@@ -196,21 +198,21 @@ def drive(lights: Lights, dt: float) -> None:
 
 
 def set_speed(track: Track, velocity: Array, sigma: tuple[float, float, float]) -> None:
-    """Let the speeds begin anew, independent of everything else."""
+    """Set the speeds in the state, independent of everything else."""
     for j, (value, one) in enumerate(zip(velocity.tolist(), sigma, strict=True), start=state_vector.SPEED):
         state_vector.cut(track.P, track.n, j)
         track.x[j], track.P[j, j] = value, one**2
 
 
 def settle(lights: Lights) -> None:
-    """Odometry has begun: the speeds in the state rest."""
+    """Odometry has started: set the speeds in the state to zero without variance."""
     lights.course.wheels = True
     for track in lights.tracks:
         set_speed(track, np.zeros(3), (0.0, 0.0, 0.0))
 
 
 def begin_scales(lights: Lights) -> None:
-    """Another source tells the way: of the scales of matches nothing is known, of wheels what an earlier run knew."""
+    """The odometry source has changed: reset its scales, of wheels to an earlier run's, of matches to the prior."""
     mean, variance = wheel_scales(lights)
     if lights.course.matched:
         mean, variance = np.zeros(3), prior_scales(lights)
@@ -221,7 +223,7 @@ def begin_scales(lights: Lights) -> None:
 
 
 def wheel_scales(lights: Lights) -> tuple[Array, Array]:
-    """Means and variances of the scales of way and turn, and of the curve, of wheels, as known before this run."""
+    """Means and variances of the wheels' scale of path, scale of turns, and curve, from an earlier run."""
     if lights.before is None:
         return np.zeros(3), prior_scales(lights)
     of = slice(state_vector.SCALE, state_vector.CURVE + 1)
@@ -229,13 +231,13 @@ def wheel_scales(lights: Lights) -> tuple[Array, Array]:
 
 
 def prior_scales(lights: Lights) -> Array:
-    """Variances of those of which nothing is known."""
+    """Prior variances of the scale of path, the scale of turns, and the curve."""
     noise = lights.settings.motion
     return np.array((noise.scale, noise.turn_scale, noise.curve)) ** 2
 
 
 def release(lights: Lights) -> None:
-    """Odometry has ended: the speeds in the state go on from its last."""
+    """Odometry has ended: the speeds in the state continue from its last velocity."""
     course, noise = lights.course, lights.settings.motion
     for track in lights.tracks:
         set_speed(track, course.velocity, (0.5 * noise.speed, noise.sideways, 0.3))
@@ -243,9 +245,9 @@ def release(lights: Lights) -> None:
 
 
 def face_forward(lights: Lights, track: Track) -> None:
-    """Without wheels, a robot found to reverse is its mirror image that drives forward: turn it round.
+    """Without odometry, turn a hypothesis round that drives backward.
 
-    Strengths and gyro cannot tell the two apart; the photodiode stays where it is.
+    RSS and gyro cannot distinguish it from its mirror image that drives forward. The photodiode stays where it is.
     """
     sigma = math.sqrt(max(float(track.P[state_vector.SPEED, state_vector.SPEED]), 0.0))
     told = lights.course.wheels or lights.course.t_mono - lights.course.t_odometry < TOLD_S
@@ -263,6 +265,6 @@ def face_forward(lights: Lights, track: Track) -> None:
 
 
 def back_to(lights: Lights, t_mono: float) -> Array:
-    """Where the robot was at an instant, seen from where it is now; the trail's begin where it was earlier still."""
+    """Pose at an earlier instant relative to the present pose; before the history, its oldest pose."""
     course = lights.course
     return se2.between(course.T, course.trail.at(t_mono, (course.t_mono, course.T)))

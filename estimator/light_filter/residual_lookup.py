@@ -1,4 +1,4 @@
-"""Looks up what a residual map says of a place."""
+"""Interpolates the residual map at a position: ln correction, sigma and gradient by lamp."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from estimator.numerics.jit import kernel
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[::1])")
 def look_up(mean: Array, sigma: Array, grid: Array, x: float, y: float, out: Array) -> None:
-    """Residual of one lamp with the photodiode at (x, y).
+    """Residual of one lamp with the photodiode at (x, y), by bilinear interpolation.
 
     Args:
         mean: (ny, nx) of the lamp.
@@ -23,8 +23,8 @@ def look_up(mean: Array, sigma: Array, grid: Array, x: float, y: float, out: Arr
         grid: (4,) of the lamp.
         x: m.
         y: m.
-        out: (4,) is filled with mean and sigma (ln) and the mean's gradient (1/m); off the grid 0 and what the grid
-            says of places where nothing was learned.
+        out: (4,) out: mean and sigma (ln), gradient of the mean (1/m). Off the grid: mean 0, and the sigma of positions
+            where nothing was learned.
     """
     u, v = (x - grid[0]) / grid[2], (y - grid[1]) / grid[2]
     ny, nx = mean.shape
@@ -42,10 +42,10 @@ def look_up(mean: Array, sigma: Array, grid: Array, x: float, y: float, out: Arr
 
 
 def expected_ln(residuals: ResidualMap, lamp_index: int, x: float, y: float) -> tuple[float, float, Array]:
-    """What to add to ln of a lamp's expected strength with the photodiode at (x, y) in the survey's frame.
+    """Value to be added to ln of a lamp's expected RSS with the photodiode at (x, y) in the survey's frame.
 
     Returns:
-        Mean and one sigma of ln, and the mean's gradient (2,) in 1/m; off the map as :func:`look_up` says.
+        Mean and one sigma of ln RSS, and the gradient (2,) of the mean in 1/m; off the map as in :func:`look_up`.
     """
     out = np.zeros(4)
     k = lamp_index
@@ -54,10 +54,10 @@ def expected_ln(residuals: ResidualMap, lamp_index: int, x: float, y: float) -> 
 
 
 class ResidualCorrections:
-    """Corrections from a map.
+    """Corrections of the light filter from a residual map.
 
     Args:
-        residuals: learned with the survey the filter has. receiver: where it sits on the robot.
+        residuals: learned with the survey of the filter. receiver: for its lever arm.
     """
 
     def __init__(self, residuals: ResidualMap, receiver: Receiver) -> None:

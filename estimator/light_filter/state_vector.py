@@ -1,22 +1,22 @@
-"""Eq. 5-7: the state of the `lights` filter and its prediction, compiled.
+"""State vector of the light filter and its time update (Eq. 5-7), compiled.
 
-State, one float64 vector with its covariance; only the first ``15 + 4 * slots`` elements are in use:
+One float64 vector with its covariance; only the first ``15 + 4 * slots`` elements are in use:
 
 =====  ==========================================================================================================
 0-2    x, y, yaw of the base in the map (m, rad)
-3-5    forward and sideways speed, yaw rate in the base frame; alive only while no odometry arrives
-6-9    errors of motion sensing: ln scale of the way, share of the turn, rad per metre (wheels); rad/s (gyro bias)
+3-5    forward and sideways speed, yaw rate in the base frame; only while no odometry arrives
+6-9    errors of motion sensing: ln scale of the path, share of the turn, rad per metre (odometry); rad/s (gyro bias)
 10     common ln gain: dirt on the receiver, supply voltage, its own gain
-11     ln of the diffuse share
-12-13  the receiver's lean beyond what was calibrated (slopes in base_link)
-14     the receiver's Lambert order beyond what was calibrated: takes up that lamps and receiver are no cosines
-15..   four per lamp: its ln gain, its lean beyond the survey (two slopes), its present model error
+11     ln of the diffuse floor
+12-13  the receiver's tilt beyond calibration (slopes in base_link)
+14     the receiver's Lambert order beyond calibration: absorbs departures of lamps and receiver from cosines
+15..   four per lamp: its ln gain, its tilt beyond the survey (two slopes), its present model error
 =====  ==========================================================================================================
 
-A lamp's lean also takes up that it shines more to one side. A model error (walls, a luminaire that is not Lambertian,
-a floor that is darker here) stays the same while the robot stands and changes as it drives on. It is a state of unit
-variance that fades with the way, scaled per link by how much may be wrong there. Twenty epochs a second of the same
-error therefore do not count as twenty witnesses.
+A lamp's tilt also absorbs an asymmetric pattern. Model errors come from walls, a luminaire that is not Lambertian, or
+darker ground. They are constant at rest and change as the robot drives on. Each is a state of unit variance that fades
+with the path length; the model's sigma scales it per link. Twenty epochs a second of the same error therefore do
+not count as twenty measurements.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from estimator.numerics.jit import kernel
 
 X, Y, YAW, SPEED, SIDE, TURN = range(6)
 SCALE, TURN_SCALE, CURVE, GYRO, COMMON, FLOOR, LEAN_X, LEAN_Y, ORDER, FIRST = range(6, 16)
-"""Places in the state."""
+"""Indices in the state."""
 OWN: Final = 4
 GAIN, TILT_X, TILT_Y, ERROR = range(OWN)
-"""Of the lamp in slot k, from ``FIRST + OWN * k`` on."""
+"""Elements of the lamp in slot k, from ``FIRST + OWN * k`` on."""
 
 SLOTS: Final = 24
-"""Lamps that have states at once; more than a receiver with 120 deg of view uses in a 2.5 m grid."""
+"""Most lamps with states at once; more than a receiver with 120 deg of view uses in a 2.5 m grid."""
 SIZE: Final = FIRST + OWN * SLOTS
 
 
@@ -71,15 +71,15 @@ def propagate(x: Array, P: Array, n: int, F: Array, Q: Array) -> None:
 
 @kernel("void(f8[::1], f8[:, ::1], i8, f8[::1], f8[::1], f8[::1])")
 def move(x: Array, P: Array, n: int, delta: Array, blame: Array, noise: Array) -> None:
-    """Move the pose by an increment in the base frame, corrected by the sensor errors known so far.
+    """Move the pose by an increment in the base frame, corrected by the estimated sensor errors.
 
     Args:
         x: state, changed in place.
         P: its covariance, changed in place.
         n: elements in use.
-        delta: (dx, dy, dyaw) as measured, with constant velocity all zero.
-        blame: (7,) by how much each of speed, sideways speed, yaw rate (s, s, s), turn share (rad), curve (m), gyro
-            bias (-s) and scale (1 or 0) takes part in this motion.
+        delta: (dx, dy, dyaw) as measured; all zero with constant velocity.
+        blame: (7,) derivatives of the motion by speed, sideways speed, yaw rate (s, s, s), turn share (rad), curve (m),
+            gyro bias (-s), scale (1 or 0).
         noise: (3,) variances along, across, of the turn.
     """
     c, s = np.cos(x[YAW]), np.sin(x[YAW])
@@ -113,7 +113,7 @@ def move(x: Array, P: Array, n: int, delta: Array, blame: Array, noise: Array) -
 
 @kernel("void(f8[::1], f8[:, ::1], i8, f8[::1], f8[::1])")
 def fade(x: Array, P: Array, n: int, keep: Array, grow: Array) -> None:
-    """Every element j shrinks to ``keep[j]`` of itself and takes on ``grow[j]`` of variance (both (n,) or longer)."""
+    """Decay and process noise: scale element j by ``keep[j]``, add variance ``grow[j]`` (both (n,) or longer)."""
     for j in range(n):
         if keep[j] != 1.0:
             x[j] *= keep[j]
@@ -126,7 +126,7 @@ def fade(x: Array, P: Array, n: int, keep: Array, grow: Array) -> None:
 
 @kernel("void(f8[:, ::1], i8, i8)")
 def cut(P: Array, n: int, j: int) -> None:
-    """Forget how element ``j`` goes with the others (before it is given a new meaning)."""
+    """Remove the covariance of element ``j`` with the others (before it is given a new meaning)."""
     for k in range(n):
         if k != j:
             P[j, k] = P[k, j] = 0.0

@@ -1,7 +1,7 @@
-"""What is known of ceiling lamps and of the receiver that looks at them.
+"""Survey types: ceiling lamps, photodiode receiver, and the survey of both.
 
-Frames: lamps stand in the survey's frame, which is the map frame (x, y in the floor's plane, z up from the floor); the
-receiver sits in base_link. A direction is given by its slopes: unit vectors (s_x, s_y, +-1) / norm. All SI.
+Frames: lamps are in the survey's frame, which is the map frame. There x, y are in the ground plane, z points up. The
+receiver is in base_link. A direction is given by its slopes: unit vectors (s_x, s_y, +-1) / norm. All SI.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Lamp:
-    """One ceiling lamp, as surveyed, as it says of itself in its data frames, or as calibrated.
+    """One ceiling lamp, as surveyed, as described in its data frames, or as calibrated.
 
     Attributes:
-        lamp_id: its number in the building, unique. code: of its CDMA code; a large building uses codes again.
+        lamp_id: its number in the building, unique. code: of its CDMA code; a large building reuses codes.
         x, y, z: of its luminous centre, m.
         power_w: mean radiant power P_t; the modulated part is the profile's depth times that.
         order: Lambert order m_t of Eq. (1), ``-ln 2 / ln cos(half angle)``.
-        slope_x, slope_y: by how much its axis leans: it shines along (slope_x, slope_y, -1).
-        sigma_ln: one sigma of ln power as far as the source can be trusted (0.05: 5 %).
+        slope_x, slope_y: tilt of its axis: it shines along (slope_x, slope_y, -1).
+        sigma_ln: one sigma of ln power by its source (0.05: 5 %).
     """
 
     lamp_id: int
@@ -39,10 +39,10 @@ class Receiver:
     """The photodiode on the robot.
 
     Attributes:
-        x, y: lever arm in base_link, m. z: height above the floor, m.
+        x, y: lever arm in base_link, m. z: height above the ground, m.
         area_m2: A of Eq. (1). responsivity: A of photocurrent per W. order: m_r, 1 for a bare photodiode.
-        half_fov_rad: angle from its axis beyond which it sees nothing.
-        slope_x, slope_y: by how much it leans in base_link: it looks along (slope_x, slope_y, 1).
+        half_fov_rad: angle from its axis beyond which it receives nothing.
+        slope_x, slope_y: tilt in base_link: its axis is (slope_x, slope_y, 1).
     """
 
     x: float = 0.0
@@ -61,8 +61,8 @@ class Survey:
     """All lamps of a building with the receiver they were calibrated for.
 
     Attributes:
-        floor: diffuse light from everywhere, as the part that one lamp's own light adds to what is received directly
-            below a lamp of the same power (theory: 1 % to 2 % in furnished rooms); start value of the floor state.
+        floor: diffuse floor: light that one lamp adds everywhere. It is a share of the direct light below a lamp of
+            equal power. Theory gives 1 % to 2 % in furnished rooms. It is the start value of the state.
         depth: modulation depth of the lamps, the profile's.
     """
 
