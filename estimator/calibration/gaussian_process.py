@@ -99,6 +99,7 @@ def choose(data: Sequence[tuple[Array, Array, Array]]) -> Hyper:
     known: dict[tuple[int, int, int], float] = {}
 
     def worth(at: tuple[int, int, int]) -> float:
+        """Summed score at grid indices, cached."""
         if at not in known:
             hyper = Hyper(AMPLITUDES[at[0]], LENGTHS_M[at[1]], NOISES[at[2]])
             known[at] = sum(score(hyper, *part) for part in data)

@@ -58,6 +58,7 @@ class Rows:
             raise ValueError("poses must be finite, amplitudes positive and noise not negative")
 
     def __len__(self) -> int:
+        """Number of observations."""
         return len(self.lamp)
 
     def chosen(self, which: npt.NDArray[np.bool_] | Index) -> Rows:

@@ -35,7 +35,7 @@ class Wheel(IntEnum):
     SCALE = 0  # of distances
     TURN = 1  # of turns
     DRIFT = 2  # rad per m
-    MOUNT_X = 3  # laser in base_link, m
+    MOUNT_X = 3  # lidar in base_link, m
     MOUNT_Y = 4
     MOUNT_YAW = 5  # rad
 
@@ -81,6 +81,7 @@ def fit_wheels(odometry: Array, laser: Array, mount: Array) -> WheelFit:
     prior = np.array(PRIOR)
 
     def cost(p: Array) -> Array:
+        """Weighted residuals of all steps, and of the priors."""
         steps = _residuals(p, W, L) * weight
         return np.concatenate((steps.ravel(), (p - begin) / prior))
 

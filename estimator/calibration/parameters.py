@@ -35,7 +35,7 @@ class Common(IntEnum):
     HEIGHT = 10  # of all lamps, m
     BULGE = 11  # departure of the luminaire type from cos^m between axis and edge, ln
     OVAL_C = 12  # excess width of the luminaire type along x over y, ln
-    OVAL_S = 13  # the same along the diagonals
+    OVAL_S = 13  # the same between the diagonals
 
 
 class Own(IntEnum):

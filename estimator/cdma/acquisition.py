@@ -107,6 +107,7 @@ class Search:
     """
 
     def __init__(self, profile: Profile, hung: Collection[int] = ()) -> None:
+        """No job in progress and no spectra computed."""
         self._profile = profile
         self._codes = gold_codes(profile.degree)
         self._table = pulse_table(profile)

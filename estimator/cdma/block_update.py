@@ -49,6 +49,7 @@ class Decoder:
     """State of the decoder of one photodiode; created by :func:`estimator.cdma.decoder.new_decoder`."""
 
     def __init__(self, profile: Profile, clock_ppm: float | None, hung: Collection[int] = ()) -> None:
+        """``clock_ppm``: stored error of the sample clock, or None; ``hung``: codes of lamps in the building."""
         self.profile = profile
         self.shape = Shape(profile)
         self.mains = Mains(profile.sample_rate, profile.mains_harmonics)
@@ -125,6 +126,7 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
     slots, span = tracks.slots, -float(sampled.x[0])
 
     def prior_at(more: float) -> Prior:
+        """Prediction of the tracks at a common delay ``lag + more``, chips."""
         return tracks.prior(slots, lag + more, LAG_VAR, clocks.clock_var, span)
 
     prior = prior_at(0.0)

@@ -49,7 +49,7 @@ def pulse_table(profile: Profile, corner: float = 1.0) -> Array:
         [[-rise, 0, 0, 0], [0, 0, 1, 0], [low**2, -(low**2), -np.sqrt(2) * low, 0], [0, high, 0, -high]]
     )
     rates, modes = np.linalg.eig(chain)
-    final = np.array([1.0, 1.0, 0.0, 1.0])  # the state a step ends in
+    final = np.array([1.0, 1.0, 0.0, 1.0])  # final state of the step response
     weights = modes * np.linalg.solve(modes, -final)
     t = np.arange(2 * STEPS + 1) / STEPS
     states = np.zeros((4, len(t)))
@@ -74,6 +74,7 @@ class Shape:
     """Pulse table in use, and the estimate of the low-pass corner."""
 
     def __init__(self, profile: Profile) -> None:
+        """Start with the nominal corner of the profile."""
         self._profile = profile
         self._wait = SOON
         self.corner = 1.0

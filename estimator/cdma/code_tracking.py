@@ -1,7 +1,7 @@
-"""Code tracking of lamps from block to block: phase and rate (the role of a DLL), RSS, life cycle, shared clocks.
+"""Code tracking of lamps from block to block: phase and rate (the role of a DLL), amplitude, life cycle, shared clocks.
 
 Each lamp has a two-state Kalman filter [phase, rate]. Shared quantities have filters of their own, so that a late time
-stamp shifts no lamp. These are the delay of the block's time stamps, the host clock drift relative to the crystals,
+stamp shifts no lamp. These are the delay of the block's time stamps, the drift of the host clock against the crystals,
 and the sample clock.
 """
 
@@ -84,13 +84,14 @@ class Clocks:
     """
 
     def __init__(self, profile: Profile, clock_ppm: float | None) -> None:
+        """``clock_ppm``: stored error of the sample clock; None: not known yet."""
         self._chip_rate = profile.chip_rate
         self.known = clock_ppm is not None
         self.clock = 0.0 if clock_ppm is None else clock_ppm * 1e-6
         self.clock_var = UNTRIED**2
         self.proven, self._proven_var = self.clock, self.clock_var
         self.guess: float | None = None
-        self.state = np.zeros(2)  # lag, drift
+        self.state = np.zeros(2)  # delay, drift
         self.cov = np.diag([(STAMP_S * self._chip_rate) ** 2, (3e-5) ** 2])
 
     def predict(self, dt: float) -> None:
@@ -132,6 +133,7 @@ class Tracks:
     """Slots of tracked lamps. Phases are in chips at time ``t``, without the common delay, never wrapped."""
 
     def __init__(self, profile: Profile) -> None:
+        """All slots free."""
         self._codes = gold_codes(profile.degree)
         self._chip_rate = profile.chip_rate
         self._crystal = 0.6e-6 * profile.crystal_ppm

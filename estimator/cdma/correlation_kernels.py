@@ -27,7 +27,7 @@ def first_from(x: F8, begin: int, limit: float) -> int:
     low, high = begin, x.shape[0]
     while low < high:
         middle = (low + high) // 2
-        if x[middle] < limit or limit != limit:  # no number: behind all of them
+        if x[middle] < limit or limit != limit:  # NaN: behind all of them
             low = middle + 1
         else:
             high = middle

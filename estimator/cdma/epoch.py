@@ -18,9 +18,9 @@ class BlockFlag(IntFlag):
     """Defects of a block; several may be set."""
 
     NONE = 0
-    CLIPPED = 1  # some samples at the rails; they were left out
+    CLIPPED = 1  # some samples at the rails; they were masked
     SATURATED = 2  # too many at the rails: no amplitudes
-    FLAT = 4  # no variation at all: dark and unlit, or a dead converter
+    FLAT = 4  # no variation at all: no light, or a dead converter
     MALFORMED = 8  # impossible words, rate or times
     LENGTH = 16  # shorter than a code period, or too long to process
     STALLED = 32  # a bus stall inside; amplitudes are not to be used

@@ -27,17 +27,20 @@ class BitRings:
     """Soft bits of all tracked lamps, folded on the frame's length, so that weak lamps gain by repetition."""
 
     def __init__(self, capacity: int) -> None:
+        """``capacity``: number of slots."""
         self._rings: Array = np.zeros((2, capacity, FRAME_BITS))  # sums and weights
         self._last: Index = np.full((capacity, FRAME_BITS), -1)
         self._due: Index = np.zeros(capacity, np.int64)
 
     @property
     def _sum(self) -> Array:
+        """(capacity, FRAME_BITS) sum of soft / variance."""
         view: Array = self._rings[0]  # not stored: a pickled view would become an array of its own
         return view
 
     @property
     def _weight(self) -> Array:
+        """(capacity, FRAME_BITS) sum of 1 / variance."""
         view: Array = self._rings[1]
         return view
 
@@ -71,7 +74,7 @@ class BitRings:
         if not len(due):
             return []
         rows = slots[due]
-        known = self._sum[rows] ** 2 > KNOWN**2 * self._weight[rows]  # never without any weight
+        known = self._sum[rows] ** 2 > KNOWN**2 * self._weight[rows]  # False where the weight is 0
         found = []
         for k in due[known.all(axis=1)]:
             slot = int(slots[k])

@@ -55,6 +55,7 @@ class Mains:
     """Frequency tracker of the flicker, with the orthonormal basis for blocks of one size."""
 
     def __init__(self, sample_rate: float, harmonics: int) -> None:
+        """``sample_rate``: nominal, samples per second; ``harmonics``: multiples of the flicker that are modelled."""
         self._rate = sample_rate
         self._harmonics = harmonics
         self._frequency = 0.0

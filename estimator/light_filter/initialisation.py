@@ -192,7 +192,7 @@ def new_track(lights: Lights, T_map_base: Array, covariance: Array, old: Track |
         track.P[j, j] = sigma**2
         if old is not None and not (
             lights.course.matched and old is lights.before and j <= state_vector.CURVE
-        ):  # of wheels
+        ):  # scales of wheels do not apply to scan matches
             track.x[j], track.P[j, j] = old.x[j], min(2.0 * float(old.P[j, j]) + (0.2 * sigma) ** 2, sigma**2)
     return track
 

@@ -121,6 +121,7 @@ class _Price:
     """
 
     def __init__(self, x0: Array, P0: Array, links: Array, out: Array) -> None:
+        """``x0``, ``P0``: prediction; ``links``, ``out``: see `take_in`."""
         self._x0, self._P0 = x0, P0
         self._used = out[:, WHITE] < math.inf
         self._white = out[:, WHITE].copy()
@@ -141,7 +142,7 @@ class _Price:
         off = x - self._x0
         off[YAW] = se2.wrap(float(off[YAW]))
         off, r = off[self._at], out[self._used, RESIDUAL]
-        prior = np.sum(off[:, None] * self._L * off)  # not by a matrix product, which would wake BLAS threads
+        prior = np.sum(off[:, None] * self._L * off)  # not by a matrix product, which would start BLAS threads
         return float(prior + np.sum(r * r / self._white[self._used]))
 
 

@@ -95,7 +95,7 @@ class Catalogue:
     def learn(self, frame: LampFrame, code: int, t_mono: float) -> tuple[Lamp, bool]:
         """Lamp of a data frame, and whether the survey (which takes precedence) disagrees with the frame."""
         known, told = self.by_id.get(frame.lamp_id), self.told.get(frame.lamp_id)
-        if told is not None and told[0] is frame and told[1] == code and told[2] is known:  # as in the block before
+        if told is not None and told[0] is frame and told[1] == code and told[2] is known:  # unchanged since then
             self.touch(frame.lamp_id, t_mono)
             return known, told[3]
         if known is None or (frame.lamp_id not in self.surveyed and contradicts(frame, code, known)):

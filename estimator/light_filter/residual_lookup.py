@@ -61,6 +61,7 @@ class ResidualCorrections:
     """
 
     def __init__(self, residuals: ResidualMap, receiver: Receiver) -> None:
+        """Index the lamps of the map."""
         self._map, self._arm = residuals, np.array((receiver.x, receiver.y, 0.0))
         self._index = {lamp_id: k for k, lamp_id in enumerate(residuals.lamp_ids)}
 

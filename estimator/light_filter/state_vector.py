@@ -86,7 +86,7 @@ def move(x: Array, P: Array, n: int, delta: Array, blame: Array, noise: Array) -
     scale = 1.0 + blame[6] * x[SCALE]
     add = blame[2] * x[TURN] + blame[3] * x[TURN_SCALE] + blame[4] * x[CURVE] + blame[5] * x[GYRO]
     u, v = scale * delta[0] + blame[0] * x[SPEED], scale * delta[1] + blame[1] * x[SIDE]
-    h = 0.5 * add  # the path bends with the correction
+    h = 0.5 * add  # the displacement turns by half the correction
     ux, uy = c * u - s * v, s * u + c * v
     wx, wy = ux - h * uy, uy + h * ux
     ex, ey = c - h * s, s + h * c

@@ -1,6 +1,6 @@
 """Sparse L D L^T factorisation and solution of symmetric systems of 3 x 3 blocks (pose graph).
 
-The kernels unroll the 3 x 3 products by hand. The column pattern comes from `elimination_ordering`.
+The sparsity pattern comes from `elimination_ordering`.
 """
 
 from __future__ import annotations

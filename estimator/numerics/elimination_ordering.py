@@ -154,7 +154,7 @@ def renew(k: int, p: int, i: int, graph: Quotient, passed: Passed, marks: tuple[
         if gone[e]:
             continue
         if weight[e] == tag:
-            gone[e] = 1  # all of it lies in the new element
+            gone[e] = 1  # it lies completely in the new element
             continue
         near[out] = e
         out += 1

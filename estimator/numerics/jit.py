@@ -89,7 +89,7 @@ def _get_ready() -> None:
     """
     hide = _BLAS not in sys.modules
     if hide:
-        sys.modules[_BLAS] = None  # type: ignore[assignment]  # the documented way to block an import
+        sys.modules[_BLAS] = None  # type: ignore[assignment]  # documented method to block an import
     try:
         import_module("numba.np.arraymath")
     finally:

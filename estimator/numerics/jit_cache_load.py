@@ -34,6 +34,7 @@ class _Kept(_upstream.JITCodeLibrary):  # type: ignore[misc]  # untyped upstream
 
     @classmethod
     def _unserialize(cls, owner: Any, state: Any) -> Any:
+        """Load machine code from the cache, and keep the bitcode as bytes."""
         name, kind, data = state
         if kind != "object":
             return super()._unserialize(owner, state)
@@ -46,6 +47,7 @@ class _Kept(_upstream.JITCodeLibrary):  # type: ignore[misc]  # untyped upstream
 
     @property
     def _shared_module(self) -> Any:
+        """Module parsed from the bitcode on first use."""
         if self._bitcode:
             self._read, self._bitcode = llvmlite.binding.parse_bitcode(self._bitcode), b""
             self._codegen._engine._load_defined_symbols(self._read)
@@ -56,6 +58,7 @@ class _Kept(_upstream.JITCodeLibrary):  # type: ignore[misc]  # untyped upstream
         self._read = module
 
     def get_pointer_to_function(self, name: str) -> int:
+        """Address of a function; a Python wrapper is found without the bitcode."""
         if self._bitcode and name.startswith(_WRAPPER):  # is present; other names are in the unparsed bitcode
             self._codegen._engine._defined_symbols.add(name)
         return int(super().get_pointer_to_function(name))
