@@ -1,8 +1,8 @@
 """Odometry and lidar mount calibration from one drive: wheel odometry compared with lidar poses.
 
-The lidar moves as X^-1 W X: W is the motion of the base by odometry, X the pose of the lidar on the base
-(simultaneous calibration; A. Censi et al., IEEE Trans. Robotics 29, 2013). Odometry errors are a scale of distance, a
-scale of turns (their track: turns are measured over it) and a turn per metre (wheels of unequal size).
+The lidar moves as X^-1 W X: W is the motion of the base by odometry, X the pose of the lidar on the base (simultaneous
+calibration; A. Censi et al., IEEE Trans. Robotics 29, 2013). Odometry errors are a scale of distance, a scale of turns
+(their track: turns are measured over it) and a turn per metre (wheels of unequal size).
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Cost    sum_i q_i c^2/2 ln(1 + (r_i / (c s_i))^2) + 1/2 sum_k ((theta_k - before_k) / prior_k)^2
 with    s_i^2 = scale^2 (0.03^2 + doubt_i^2) + noise_i^2,   q_i = 1 / (rows in the same patch of ground)
 
-The model error is the same for all observations of one patch. A thousand rows beside one wall hold little
-information. All rows of a patch together weigh as one row, so that the priors keep their weight against them.
+The model error is the same for all observations of one patch. A thousand rows beside one wall hold little information.
+All rows of a patch together weigh as one row, so that the priors keep their weight against them.
 
 The scale is estimated from the residuals (median absolute deviation) and the fit is repeated. RSS far below the
 expectation was blocked; RSS far above it came by a mirror or from another lamp. Both are rejected after the first

@@ -7,9 +7,9 @@ all of it at once when a condition ends.
 
 A lamp of amplitude A adds A^2 to the residual's variance per sample. Its correlation over n samples adds n A^2 to that
 of its own detector. A rise of the noise by `RISE` is a lamp 15 times its noise (n = 1111). The very next sweep finds
-it. A weaker lamp above the detection threshold of 5.2 takes up to `LONGEST` blocks: two slow sweeps and the blocks
-that confirm it. Codes outside the survey take turns in slow sweeps, `TURNS` sweeps for all of them. A lamp outside
-the survey may be reported later, and most codes belong to no lamp.
+it. A weaker lamp above the detection threshold of 5.2 takes up to `LONGEST` blocks: two slow sweeps and the blocks that
+confirm it. Codes outside the survey take turns in slow sweeps, `TURNS` sweeps for all of them. A lamp outside the
+survey may be reported later, and most codes belong to no lamp.
 """
 
 from __future__ import annotations

@@ -108,8 +108,7 @@ def search(decoder: Decoder, codes: int) -> None:
     """Search for further lamps, with the effort of ``codes`` codes (6 us each with profile A).
 
     Other work counts as an equivalent number of codes, or has a call of its own. While nothing indicates further lamps,
-    a
-    small part of the effort is used: estimator/cdma/acquisition_budget.py.
+    a small part of the effort is used: estimator/cdma/acquisition_budget.py.
     """
     decoder.shape.renew()
     allowed = decoder.watch.allow(codes)

@@ -1,7 +1,7 @@
 """Collinear lamps: extra covariance and minimum variances for the directions they cannot observe.
 
-Lamps on one line determine the distance from it only by their common RSS, the least certain quantity.
-They do not determine the side of the line. They determine the heading only by the change of that distance.
+Lamps on one line determine the distance from it only by their common RSS, the least certain quantity. They do not
+determine the side of the line. They determine the heading only by the change of that distance.
 """
 
 from __future__ import annotations

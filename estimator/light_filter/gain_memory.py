@@ -65,9 +65,9 @@ def expected_of(lights: Lights, lamp_id: int) -> tuple[Sequence[float], Sequence
 def bend(lights: Lights, used: list[Sight]) -> None:
     """Update the gain consistency of the likeliest hypothesis (`model_consistency.Bent`).
 
-    The value of a lamp is the sum of squared normalised deviations of its gain, tilt and link error. The link
-    error counts in its usual sigma, although its initial variance is larger. Plain numbers are used: arrays of three
-    would cost a sixth of the whole update.
+    The value of a lamp is the sum of squared normalised deviations of its gain, tilt and link error. The link error
+    counts in its usual sigma, although its initial variance is larger. Plain numbers are used: arrays of three would
+    cost a sixth of the whole update.
 
     ``used``: links accepted in the latest epoch. Without any, or with those of another hypothesis, nothing changes.
     """

@@ -236,8 +236,8 @@ def rule_out(lights: Lights, epoch: LightEpoch) -> None:
     """Drop hypotheses that cannot see lamps whose data frames were received.
 
     Where codes repeat this decides, even at rest. The last hypotheses are dropped, and the start restarts with the
-    frames,
-    under one condition: most of these lamps, and at least two, are out of sight. A single one may have been moved.
+    frames, under one condition: most of these lamps, and at least two, are out of sight. A single one may have been
+    moved.
     """
     named = [
         (lights.catalogue.by_id[frame.lamp_id], float(epoch.amplitude[i]))

@@ -118,8 +118,8 @@ class LightChannel:
     def look_on(self, codes: int) -> None:
         """Search for further lamps with the effort of ``codes`` codes.
 
-        If only every other cycle brings a block, the cycle that decoded it postpones search and effort to the next.
-        A lamp is still found before the next block, and no cycle does both.
+        If only every other cycle brings a block, the cycle that decoded it postpones search and effort to the next. A
+        lamp is still found before the next block, and no cycle does both.
         """
         busy = self._decoded and not self._decoded_before and len(self.decoder.tracks.slots) > 0
         self._decoded_before, self._decoded = self._decoded, False

@@ -3,9 +3,8 @@
     predict -> (start) -> associate links -> linearise -> gate -> update -> decide -> result
 
 It never uses the lidar's position. As an independent solution it gives the paper's T_1 and virtual consistent
-components. Equations
-are in lambertian.py (1, 2, 7), state_vector.py and measurement_update.py (5-7). docs/lights.md links equations and
-code.
+components. Equations are in lambertian.py (1, 2, 7), state_vector.py and measurement_update.py (5-7). docs/lights.md
+links equations and code.
 """
 
 from __future__ import annotations

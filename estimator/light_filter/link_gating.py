@@ -128,8 +128,7 @@ def judge(lights: Lights, track: Track, kept: list[Sight], out: Array, news: flo
     Gating waits until the position is certain. Before, a deviation only raises the noise of the link: position or gain
     may be wrong instead. An occluded lamp is an exception, because it would pull the position twenty times a second. A
     robot at rest would drift to where the lamp fits. It therefore only lowers the likelihood of the hypothesis. Other
-    deviations
-    bring no new information while odometry reports rest: exchanged lamps would make the position diverge.
+    deviations bring no new information while odometry reports rest: exchanged lamps would make the position diverge.
 
     Args:
         lights: state of the filter.

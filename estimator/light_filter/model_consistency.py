@@ -1,8 +1,8 @@
 """Gain consistency monitor: squared normalised deviation of estimated lamp gains and tilts from their prior.
 
 A large value means that the pose is probably wrong. Light reflected by a wall fits a wrong pose, several sigmas off,
-with improbable lamps. So does the light of two lamps whose codes were exchanged. For a while, so does a lamp that
-fades out. `light_inflation` derives the inflation of the light pose.
+with improbable lamps. So does the light of two lamps whose codes were exchanged. For a while, so does a lamp that fades
+out. `light_inflation` derives the inflation of the light pose.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ One float64 vector with its covariance; only the first ``15 + 4 * slots`` elemen
 
 A lamp's tilt also absorbs an asymmetric pattern. Model errors come from walls, a luminaire that is not Lambertian, or
 darker ground. They are constant at rest and change as the robot drives on. Each is a state of unit variance that fades
-with the path length; the model's sigma scales it per link. Twenty epochs a second of the same error therefore do
-not count as twenty measurements.
+with the path length; the model's sigma scales it per link. Twenty epochs a second of the same error therefore do not
+count as twenty measurements.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 Before numba searches its cache it prepares to compile: it imports a hundred of its modules and fills its type tables.
 With the machine code of a kernel it also reads the bitcode, for inlining into kernels yet to be compiled. A start that
 compiles nothing needs neither: that is two thirds of the loading time of the kernels, and 30 MB. So only the machine
-code is loaded; bitcode is parsed on first use.
-numba also compiles its reference counting, to be inlined into kernels. Cached kernels already contain it and need only
-the addresses of the functions it calls. That is a third of the rest, and LLVM's compiler is not used at all.
+code is loaded; bitcode is parsed on first use. numba also compiles its reference counting, to be inlined into kernels.
+Cached kernels already contain it and need only the addresses of the functions it calls. That is a third of the rest,
+and LLVM's compiler is not used at all.
 
 Most of this relies on private parts of numba. With a version that lacks them, numba's own cache is used.
 """
