@@ -103,8 +103,7 @@ class Under:
     """Collinearity of the lamps in use over time; initial state ``Under()``.
 
     Attributes:
-        t: instant since which they are collinear, inf: they are not. at: (2,) dead-reckoned position at that instant,
-            m.
+        t: instant since which they are collinear, inf: they are not. at: (2,) dead-reckoned position then, m.
         far: largest distance from there since, m; inf: only collinear lamps have determined the pose.
         P: (3, 3; m, m, rad; survey axes) covariance of the pose at that instant.
         told: lamps that are not collinear, or the operator, have determined the pose before.

@@ -45,8 +45,7 @@ class Corrections(Protocol):
 
         Returns:
             One row per lamp: mean and sigma of ln RSS, gradient of the mean along x and y (1/m). Sigma is negative for
-                a lamp
-            that is not in the map.
+            a lamp that is not in the map.
         """
 
 
