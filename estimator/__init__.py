@@ -1,6 +1,7 @@
-"""Numbers only: SI arrays in, poses with their uncertainty out. No operating system, no devices, no clock.
+"""Pose estimation from lidar, ceiling lamps, odometry and gyro: SI arrays in, poses with covariance out.
 
-This module exports what the other rooms need of the estimator. A module is loaded when one of its names is used.
+The package uses no operating system, no devices and no clock. This module exports the names that other packages need. A
+module loads when one of its names is used.
 """
 
 from __future__ import annotations

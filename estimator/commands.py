@@ -1,4 +1,4 @@
-"""What a person or a PLC may order: set the pose, forget the map, or look for the place in it."""
+"""Operator commands: set the pose, reset the map, relocalise, or use the stored pose of the previous run."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from estimator.state import State
 
 
 def obey(state: State, command: Command) -> None:
-    """SET_POSE moves the whole map so that the robot stands there; RESET forgets the map and begins at that pose.
+    """Execute a command.
 
-    A map of this session has no other tie to the world than what it is told, so it moves as one piece; where the place
-    in it is not known, only what is detached moves. A map that was restored stays as it is, and the robot is looked for
-    in it about that pose. A pose that is no number is ignored; RESET without a pose begins at the origin. RELOCALISE
-    looks for the robot everywhere in the map, and begins a new local map, because the old one may be that of another
-    place. REMEMBERED tells a robot that has been switched on in a stored map where it was last: it is believed there
-    without driving if it fits nowhere else. ``T_odom_base`` stays as it is.
+    SET_POSE moves the whole map so that the robot has that pose; RESET clears the map and starts at that pose. Only
+    this pose connects a map of this session to the world, so the map moves as one body. While the robot's pose in it is
+    not known, only what is detached moves. A restored map stays as it is, and the search for the robot starts about
+    that pose. A non-finite pose is ignored; RESET without a pose starts at the origin. RELOCALISE searches the robot
+    everywhere in the map. It restarts the local map, because the old one may be of another position. REMEMBERED passes
+    the stored pose to a robot that starts in a stored map. It is accepted there without driving if the robot fits
+    nowhere else. ``T_odom_base`` stays as it is.
     """
     T_map_base = command.T_map_base
     if T_map_base is not None and not np.isfinite(T_map_base).all():
@@ -46,7 +47,7 @@ def obey(state: State, command: Command) -> None:
 
 
 def remember(state: State, T_map_base: Array | None) -> None:
-    """Guess that the robot stands where it stood; of no use where its place is known, or was looked for anew since."""
+    """Use the stored pose as unconfirmed pose; no effect where the pose is known, or a search has started since."""
     parts, search = state.map.parts, state.relocalisation.search
     if T_map_base is None or parts.detached is None or not parts.session_start or search.hint is not None:
         return
@@ -55,12 +56,12 @@ def remember(state: State, T_map_base: Array | None) -> None:
 
 
 def look_at_once(state: State) -> None:
-    """Begin a new local map: its first keyframe is laid with the next scan, and looked for."""
+    """Restart the local map: the next scan then becomes its first keyframe, and is searched."""
     state.matching.local_map, state.matching.failures = None, 0
 
 
 def place(state: State, T_map_base: Array) -> None:
-    """Move the map frame so that the robot's pose is ``T_map_base``, and everything in the map with the robot."""
+    """Move the map frame so that the robot's pose is ``T_map_base``, and the detached map with the robot."""
     T_odom_base = state.motion.T_odom_base
     T_map_odom = se2.compose(T_map_base, se2.inverse(T_odom_base))
     apply_correction(state.map, state.pose, T_map_odom, state.map.parts.detached_since, T_odom_base)

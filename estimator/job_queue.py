@@ -1,4 +1,4 @@
-"""The queue of background jobs: what is to be handed out, and what waits for an answer."""
+"""The queue of background jobs: those to be started, and those whose result is pending."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ from typing import Final
 from estimator.measurements import Answer, Job
 
 LOST: Final = 100
-"""Keyframes after which a job that has not answered is given up: a job that failed never answers."""
+"""Keyframes after which a job without a result is abandoned: a failed job never returns one."""
 
 SEARCH, SOLVE, SETTLE, DRAW = 3, 2, 1, 9
-"""Priorities, lowest first: search the map, solve the graph, settle a submap; draw the map after all of these."""
+"""Priorities, lowest first: search the map, solve the graph, finish a submap; draw the map after all of these."""
 
 Apply = Callable[[object], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pending:
-    """A job without an answer yet.
+    """A job without a result yet.
 
     Attributes:
-        owner: on whose behalf it runs, None for nobody in particular. keyframes: count of keyframes when it was asked
-            for. apply: takes the answer's payload.
+        owner: object that the job belongs to, None for no particular one.
+        keyframes: count of keyframes when it was queued.
+        apply: receives the result's payload.
     """
 
     owner: object
@@ -36,8 +37,10 @@ class JobQueue:
     """All background jobs of the estimator.
 
     Attributes:
-        waiting: to be handed out with the next result. pending: without an answer yet, by job ID. next_id: of the next
-            job, never used twice. keyframes: laid since the queue was last cleared, a clock for jobs that failed.
+        waiting: to be started with the next result of a step.
+        pending: without a result yet, by job ID.
+        next_id: of the next job, never used twice.
+        keyframes: created since the queue was last cleared, a clock for failed jobs.
     """
 
     waiting: list[Job] = field(default_factory=list)
@@ -46,39 +49,39 @@ class JobQueue:
     keyframes: int = 0
 
     def ask(self, priority: int, run: Callable[[], object], apply: Apply, owner: object = None) -> None:
-        """Queue a job; ``apply`` takes its payload in the step that receives the answer."""
+        """Queue a job; ``apply`` receives its payload in the step with the result."""
         self.waiting.append(Job(self.next_id, priority, run))
         self.pending[self.next_id] = Pending(owner, self.keyframes, apply)
         self.next_id += 1
 
     def busy(self, owner: object) -> bool:
-        """Whether a job of this owner has no answer yet."""
+        """Whether a job of this owner is pending."""
         return any(job.owner is owner for job in self.pending.values())
 
     def cancel(self, owner: object) -> None:
-        """Ignore the answers to this owner's jobs."""
+        """Ignore the results of this owner's jobs."""
         self.pending = {job_id: job for job_id, job in self.pending.items() if job.owner is not owner}
 
     def count_keyframe(self) -> tuple[object, ...]:
-        """Count a keyframe and give up the jobs that must have failed; returns the owners of these."""
+        """Count a keyframe and abandon the jobs that must have failed; returns their owners."""
         self.keyframes += 1
         lost = [job_id for job_id, job in self.pending.items() if self.keyframes - job.keyframes > LOST]
         return tuple(self.pending.pop(job_id).owner for job_id in lost)
 
     def answer(self, answer: Answer) -> None:
-        """Apply an answer; one that nothing waits for any more is dropped."""
+        """Apply a result; one of an abandoned job is dropped."""
         job = self.pending.pop(answer.job_id, None)
         if job is not None:
             job.apply(answer.payload)
 
     def take(self) -> tuple[Job, ...]:
-        """The jobs to be handed out now."""
+        """The jobs to be started now."""
         jobs = tuple(self.waiting)
         self.waiting.clear()
         return jobs
 
     def clear(self) -> None:
-        """Forget all jobs; answers that still come are dropped."""
+        """Remove all jobs; results that still arrive are dropped."""
         self.waiting.clear()
         self.pending.clear()
         self.keyframes = 0

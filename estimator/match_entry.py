@@ -1,4 +1,4 @@
-"""One match for the match journal: what the matcher was given, its result, and what light said beside it."""
+"""Record of one match for the match journal: the matcher's input and result, with the light solution beside them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from estimator.state import State
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightPoint:
-    """One lamp as a point of the paper's Eq. 13: its place in body frames, which light alone has told.
+    """One lamp as a point of the paper's Eq. 13: its position in body frames by light alone.
 
     Attributes:
-        reference: in the frame of the newest keyframe, ``X_ref^-1 L``; None if light said nothing good there.
+        lamp_id, code: number of the lamp, and its code.
+        reference: in the frame of the newest keyframe, ``X_ref^-1 L``; None without a valid light solution there.
         present: in the present body frame, ``X_new^-1 L``.
-        residual: how far the matched motion since the keyframe carries ``present`` from ``reference`` (x, y in m, frame
-            of the keyframe); None without a reference or a match.
-        logarithm: of received over expected strength in the latest epoch, None if it was not received.
+        residual: ``present``, transformed by the matched motion since the keyframe, minus ``reference`` (x, y in m,
+            frame of the keyframe); None without a reference or a match.
+        logarithm: ln of received over expected RSS in the latest epoch, None if it was not received.
     """
 
     lamp_id: int
@@ -38,9 +39,9 @@ class LightPoint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightSaid:
-    """What light said at a scan: how far its fix had come, the pose T_map_base if it was good, and the lamps in use.
+    """Light solution at a scan: state of the fix, the pose T_map_base if it is valid, and the lamps in use.
 
-    ``keyframe`` is the ID of the newest one, laid at ``T_odom_keyframe``.
+    ``keyframe`` is the ID of the newest one, created at ``T_odom_keyframe``.
     """
 
     fix: Fix
@@ -52,7 +53,7 @@ class LightSaid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entry:
-    """One match as it was asked and answered, and what light said; a few references, nothing computed yet."""
+    """Input and result of one match, and the light solution; a few references, nothing computed yet."""
 
     scan: Scan
     points: ScanPoints
@@ -62,12 +63,12 @@ class Entry:
 
 
 def entry_of(state: State, scan: Scan, points: ScanPoints, asked: Asked | None, result: MatchResult) -> Entry:
-    """Keep a match, from within `State.journal`: after the match and before it is fused."""
+    """Record of a match, called by `State.journal`: after the match and before it is fused."""
     return Entry(scan, points, asked, result, light_said(state, result))
 
 
 def light_said(state: State, match: MatchResult) -> LightSaid | None:
-    """What light said at this scan; None where there is no photodiode."""
+    """Light solution at this scan; None without a photodiode."""
     if state.light is None:
         return None
     light = state.light

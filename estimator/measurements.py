@@ -1,4 +1,4 @@
-"""Typed SI records that go into `step`, each with the interval of ``t_mono`` in which it was true.
+"""Measurement types: the SI records that `step` consumes, each with its interval of ``t_mono``, and caps of a step.
 
 Frames follow REP-103: x forward, y left, yaw counter-clockwise, metres, radians, seconds. ``T_a_b`` maps b coordinates
 into a; a planar transform is a float64 array ``(x, y, yaw)``.
@@ -14,21 +14,21 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma.epoch import LightEpoch as LightEpoch  # records too, so they are offered from here
+from estimator.cdma.epoch import LightEpoch as LightEpoch  # records too, so they are exported here
 from estimator.cdma.epoch import SampleBlock as SampleBlock
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array as Array
 
 Beams = tuple[Array, Array, npt.NDArray[np.uint8]]
-"""Bearing in the lidar frame (evenly spaced, rad), range (m), kind: what the beam kernels take."""
+"""Bearing in the lidar frame (evenly spaced, rad), range (m), kind: the input of the beam kernels."""
 
 
 class Beam(IntEnum):
-    """A beam says one of three things (glass and darkness make the third one necessary)."""
+    """Kind of a beam: surface, free, or no data (which glass and dark surfaces cause)."""
 
     HIT = 1  # there is a surface at `range_m`
     FREE = 2  # nothing up to `range_m`
-    NONE = 0  # no statement
+    NONE = 0  # no data
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,14 +36,14 @@ class Scan:
     """One revolution of a lidar in SI units. All arrays have one element per beam, in order of measurement.
 
     Attributes:
-        t_begin, t_end: ``t_mono`` of the first and of the last beam; equal when the log does not say.
+        t_begin, t_end: ``t_mono`` of the first and of the last beam; equal when the log has only one.
+        seq: the device's scan counter.
         T_base_lidar: mount of the lidar on the robot.
         bearing_rad: in the lidar frame, inversion already applied.
-        range_m: metres; meaningful where ``beam`` is HIT (surface) or FREE (bound).
+        range_m: metres; meaningful where ``beam`` is HIT (surface) or FREE (lower limit).
         beam: uint8 of :class:`Beam`.
-        intensity: device units or None; the Q of the paper's quality filter.
         sigma_m: one-sigma range noise of this kind of device.
-        seq: the device's scan counter, so that results can be told apart.
+        intensity: device units or None; the Q of the paper's quality filter.
     """
 
     t_begin: float
@@ -66,7 +66,7 @@ class Odometry:
     delta: Array  # (dx, dy, dyaw)
 
     def part_after(self, t_mono: float, delta: Array) -> Array:
-        """The part of an increment ``delta``, made over the record's interval, that lies after an instant."""
+        """The part of an increment ``delta`` over the record's interval that lies after an instant."""
         dt = self.t_end - self.t_begin
         if not dt > 0.0 or t_mono <= self.t_begin:
             return delta
@@ -75,7 +75,7 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Yaw turned over ``[t_begin, t_end]`` according to a gyro, rad."""
+    """Rotation (rad) over ``[t_begin, t_end]`` by a gyro."""
 
     t_begin: float
     t_end: float
@@ -83,21 +83,21 @@ class Imu:
 
 
 class Order(Enum):
-    """What a person or a PLC may ask of the estimator."""
+    """Commands of an operator or a PLC to the estimator."""
 
     SET_POSE = "set_pose"
     RESET = "reset"
     RELOCALISE = "relocalise"
     PAUSE = (
-        "pause"  # obeyed by the cycle: it asks for no more than :attr:`DegradationLevel.CARRIED`, and applies no answer
+        "pause"  # executed by the cycle: it skips the lidar (:attr:`DegradationLevel.CARRIED`), applies no job result
     )
     RESUME = "resume"
-    REMEMBERED = "remembered"  # by nobody: the pose that was stored when the run before ended; a witness, no order
+    REMEMBERED = "remembered"  # no operator's: the stored pose of the previous run, as evidence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Command:
-    """An order with the pose it carries, if any (``T_map_base``)."""
+    """A command with its pose, if any (``T_map_base``)."""
 
     t_begin: float
     order: Order
@@ -106,10 +106,12 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Work that must not delay a cycle (rendering, later loop search and the pose graph).
+    """Work that must not delay a cycle (rendering, loop search, pose graph).
 
     Attributes:
-        priority: lower runs first. run: calls nogil kernels in slices of at most 20 ms; returns the answer's payload.
+        job_id: number, returned with the result.
+        priority: lower runs first.
+        run: calls nogil kernels in slices of at most 20 ms; returns the payload of the result.
     """
 
     job_id: int
@@ -119,7 +121,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A job's payload, handed back in the cycle in which it is applied (recorded, so that replay repeats it)."""
+    """A job result, returned in the cycle that applies it (recorded, so that a replay repeats it)."""
 
     t_begin: float
     job_id: int
@@ -127,37 +129,39 @@ class Answer:
 
 
 Record = Scan | SampleBlock | LightEpoch | Odometry | Imu | Command | Answer
-"""What `step` takes. Light comes as a photodiode's samples, or decoded already (a foreign log, a link-level run)."""
+"""Input of `step`. Light is a block of samples, or an epoch decoded elsewhere (a third-party log, a link-level run)."""
 
 
 Lap = Callable[[str], object]
-"""Told the name of each part of a step when it has ended: ``lights``, ``match``, ``map``, ``search``. It may look at a
-clock; nothing in this room does, and nothing comes back from it."""
+"""Called with the name of each part of a step at its end: ``lights``, ``match``, ``map``, ``search``.
+
+It may read a clock; nothing in this package does. Its result is ignored.
+"""
 
 
 def no_lap(part: str) -> None:
-    """A :data:`Lap` that nobody looks at."""
+    """A :data:`Lap` without effect."""
 
 
 class DegradationLevel(IntEnum):
-    """How far a step does without: each leaves out what the ones before it leave out, and more."""
+    """Degradation level of a step: each level includes the reductions of those before it."""
 
     FULL = 0  # everything
-    THINNED = 1  # fewer iterations and points: the caps say how many
-    NO_MAP = 2  # and no keyframe is laid, no map updated, no job handed out
-    CARRIED = 3  # and scans are passed over: lights and odometry carry the pose
+    THINNED = 1  # fewer iterations and points, by the caps
+    NO_MAP = 2  # and no keyframe, no map update, no job
+    CARRIED = 3  # and no scan matches: light and odometry give the pose
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The time budget of one cycle, already turned into caps; nothing in this room reads a clock.
+    """The time budget of one cycle as caps; nothing in this package reads a clock.
 
     Attributes:
         icp_iterations: cap on matching iterations.
-        points: cap on query points per match (the scan is thinned evenly above it).
+        points: cap on query points per match (the scan is subsampled evenly above it).
         update_map: whether keyframe and map work may run in this cycle.
-        codes: effort for lamps not seen yet, in light codes that could be searched (6 us each with profile A).
-        level: what the step leaves out, :class:`DegradationLevel`.
+        codes: effort for lamps not received yet, in codes that could be searched (6 us each with profile A).
+        level: degradation level, :class:`DegradationLevel`.
     """
 
     icp_iterations: int
@@ -168,4 +172,4 @@ class Limits:
 
 
 UNLIMITED: Final = Limits(icp_iterations=50, points=100_000, update_map=True)
-"""Caps that never bind; what replay of a foreign log uses."""
+"""Caps without effect, for the replay of a third-party log."""

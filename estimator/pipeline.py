@@ -1,4 +1,4 @@
-"""The method, as one readable step: predict -> lights -> virtual frame -> match -> fuse -> keyframe -> map."""
+"""One estimator step: predict, light filter, virtual frame, scan match, fusion, keyframe, map update."""
 
 from __future__ import annotations
 
@@ -61,14 +61,13 @@ __all__ = ["Settings", "State", "keyframe_poses", "new_state", "render_map", "st
 
 
 FLOOR = np.diag((0.005**2, 0.005**2, 0.003**2))
-"""Variance of what no filter knows of: stamps, sweep and mount of a moving robot."""
+"""Covariance of errors outside every filter: stamps, scan duration and mount of a moving robot."""
 
 
 def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_lap) -> StepResult:
-    """Take the records since the last step, in the order in which they were true (`in_turn`), and return the pose then.
+    """Process the records since the last step, in time order (`in_turn`), and return the resulting pose.
 
-    Never raises for what a sensor delivers: a scan that cannot be matched leaves the prediction, and the result has
-    the reason.
+    It raises nothing for any sensor data: a scan without a match leaves the prediction, and the result has the reason.
     """
     result: MatchResult | None = None
     keyframe = -1
@@ -95,7 +94,7 @@ def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_
 
 
 def see_scan(state: State, scan: Scan, limits: Limits, refusal: Reason | None, lap: Lap) -> tuple[MatchResult, int]:
-    """Match a scan where the robot was when it was true, and carry the pose on again; the match, and an ID or -1."""
+    """Match a scan at the pose of its own instant and re-propagate; returns the match, and a keyframe ID or -1."""
     if refusal is not None or not out_of_sequence.late(state.motion, scan):
         return see(state, scan, limits, refusal, lap)
     ahead = out_of_sequence.go_back(state.pose, state.motion, scan)
@@ -105,7 +104,7 @@ def see_scan(state: State, scan: Scan, limits: Limits, refusal: Reason | None, l
 
 
 def see(state: State, scan: Scan, limits: Limits, refusal: Reason | None, lap: Lap) -> tuple[MatchResult, int]:
-    """Match a scan at the pose, fuse it, and extend the map by it where a keyframe is due; the match, an ID or -1."""
+    """Match a scan at the pose, fuse it, and create a keyframe where one is due; returns the match, an ID or -1."""
     points = nothing_of(scan) if refusal else virtual_frame(state, scan)
     count_steps(state.settings, state.motion, state.matching)
     match = match_scan(state, scan, points, limits, refusal)
@@ -122,16 +121,16 @@ def see(state: State, scan: Scan, limits: Limits, refusal: Reason | None, lap: L
 
 
 def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
-    """Eq. 14-15: take a match into the pose, and its motion into the light filter and the time offset."""
+    """Eq. 14-15: update the pose by a match, the light filter by its motion, and the time offset."""
     more = fuse(state.pose, state.motion, state.matching, match, state.settings.noise)
-    if more is not None:  # the way too, or no loop could bring submaps together again
+    if more is not None:  # the path too, or no loop could join submaps again
         state.map.graph.loosen(more, state.pose.T_odom_anchor)
     guide(state.light, state.motion, match)
     time_offset.on_match(state.time_offset, scan, match)
 
 
 def extends_map(state: State, points: ScanPoints, match: MatchResult) -> bool:
-    """Whether a keyframe is due; never from next to nothing, nor where the robot may have been carried off."""
+    """Whether a keyframe is due; never with too few points, nor where the robot may have been kidnapped."""
     if (match.ok and kidnap_detection.waits(state)) or len(points.xy) < state.settings.matching.min_points:
         return False
     every_step = not state.settings.newest_only
@@ -162,25 +161,25 @@ def extend_map(state: State, scan: Scan, points: ScanPoints, limits: Limits, mat
 
 
 def passed_over(state: State, scan: Scan, limits: Limits) -> Reason | None:
-    """Why a scan is not matched in this step, if it is not: lights and odometry carry the pose, or it is too old."""
+    """Reason to skip the match of a scan in this step, None to match: the lidar is skipped, or the scan is too old."""
     if limits.level >= DegradationLevel.CARRIED:
         return Reason.PASSED_OVER
     return Reason.LATE if out_of_sequence.too_old(state.motion, scan) else None
 
 
 def order(record: Record) -> tuple[float, bool]:
-    """Records go by the instant up to which they speak; a scan after whatever moved the robot until then."""
+    """Sort key of records: the end of their interval; a scan follows the records that moved the robot until then."""
     end = record.t_end if isinstance(record, Scan | SampleBlock | LightEpoch | Odometry | Imu) else record.t_begin
     return end if in_time(end) else -math.inf, isinstance(record, Scan)
 
 
 def in_turn(state: State, records: Iterable[Record]) -> list[Record]:
-    """Records in the order in which they are taken; where matches tell `lights` the way, epochs after their scan.
+    """Records in the order of their processing; with lidar odometry, light epochs follow their scan.
 
-    Until the scan has been matched nobody knows how the robot has moved since the one before, and light would be held
-    against where the velocity has carried it: of a robot that is suddenly pushed and turned that is wrong by more than
-    light is, and what light then says of the place turns its heading. No epoch waits where there is no scan, nor for a
-    scan behind an order that came later than it.
+    The robot's motion since the previous scan is known only after the match. Before it, light would be compared with
+    the extrapolation by the velocity. For a robot that is suddenly pushed and turned, that extrapolation is worse than
+    light. The resulting position error would turn its heading. No epoch waits without a scan, nor for a scan after a
+    later command.
     """
     told = sorted(records, key=order)
     guided = state.light is not None and state.light.guided is not None
@@ -204,9 +203,9 @@ def in_turn(state: State, records: Iterable[Record]) -> list[Record]:
 
 
 def predict(state: State, record: Record) -> None:
-    """Bring the pose to the record's instant: by odometry, by gyro, else at constant velocity; obey a command."""
+    """Predict the pose to the record's instant: by odometry, by gyro, else at constant velocity; execute a command."""
     if order(record)[0] == -math.inf:
-        return  # at no time
+        return  # no valid instant
     noise = state.settings.noise
     before = state.motion.T_odom_base, state.motion.P, state.motion.t_mono
     if state.light is not None:
@@ -223,14 +222,14 @@ def predict(state: State, record: Record) -> None:
         case Command():
             obey(state, record)
             map_odom_filter.on_order(state.pose, state.motion, state.light, record)
-            return  # RESET sets the odometry's covariance back: that is no motion
+            return  # RESET resets the odometry's covariance: that is no motion
     map_odom_filter.on_motion(state.pose, state.motion, *before)
 
 
 def see_light(state: State, record: SampleBlock | LightEpoch) -> None:
-    """Eq. 1-7: decode the block, if it is one, take its links into the light filter, and its news into the pose.
+    """Eq. 1-7: decode a block, update the light filter with its links, and the pose with the new information.
 
-    Without a photodiode in the setup the record is passed over.
+    Without a photodiode in the setup the record is ignored.
     """
     if state.light is not None:
         fuse_light(state, state.light.take(record))
@@ -238,25 +237,25 @@ def see_light(state: State, record: SampleBlock | LightEpoch) -> None:
 
 
 def fuse_light(state: State, lights: LightsResult) -> None:
-    """Correct T_map_odom by a result of the light filter; what was laid since the place was known comes along."""
+    """Correct T_map_odom by a light result; keyframes created since the pose was last known move along."""
     assert state.light is not None
     map_, pose = state.map, state.pose
     shift = map_odom_filter.on_lights(pose, state.motion, state.light, lights, map_.next_key)
     if shift is None:
         return
     shift_map(map_, shift.moved, max(shift.since, map_.parts.detached_since))
-    if shift.known and map_.parts.session_start:  # a stored map has come along for the last time
+    if shift.known and map_.parts.session_start:  # a stored map has moved along for the last time
         relist(map_, 0)
 
 
 def look_for_lamps(state: State, limits: Limits) -> None:
-    """Go on looking for lamps that are not followed yet, as far as this cycle can afford."""
+    """Continue the acquisition of lamps, within the cap of this cycle."""
     if state.light is not None:
         state.light.look_on(limits.codes)
 
 
 def virtual_frame(state: State, scan: Scan) -> ScanPoints:
-    """Eq. 10-11: filter the beams (Q, L) and carry each from its own instant to the scan's end."""
+    """Eq. 10-11: filter the beams (Q, L) and deskew them to the scan's end."""
     moved = se2.exp(state.motion.velocity * max(0.0, scan.t_end - scan.t_begin))
     return points_of(scan, moved, state.settings.far_m, state.settings.quality)
 
@@ -293,7 +292,7 @@ def match_scan(
 
 
 def report(state: State, match: MatchResult | None, keyframe: int, limits: Limits = UNLIMITED) -> StepResult:
-    """The estimate after this step; jobs wait for one that has the time."""
+    """The estimate after this step; jobs wait for a cycle that updates the map."""
     motion, pose, map_ = state.motion, state.pose, state.map
     alignment, P = pose.alignment, pose.covariance(motion.T_odom_base, motion.P)
     return StepResult(
@@ -325,7 +324,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
 
 
 def misplaced(state: State) -> bool:
-    """Whether light receives what it cannot receive at the pose; see `light_evidence.misplaced`."""
+    """Whether the links are impossible at the pose; see `light_evidence.misplaced`."""
     alignment = state.pose.alignment
     if alignment is None or not alignment.placed:
         return False
@@ -335,7 +334,7 @@ def misplaced(state: State) -> bool:
 
 
 def known_axes(state: State, match: MatchResult | None, P: Array) -> Array:
-    """The axes known in the map frame: in the survey by the pose's covariance ``P``, else those that the match shows.
+    """The axes known in the map frame: in the survey by the pose's covariance ``P``, else those of the match.
 
     A corridor along x of the odom frame may run along y of the map.
     """
@@ -348,7 +347,7 @@ def known_axes(state: State, match: MatchResult | None, P: Array) -> Array:
 
 
 def keyframe_poses(state: State) -> dict[int, Array]:
-    """``T_map_keyframe`` by ID as corrected so far, 0 being the start; those let go only where history is kept."""
+    """``T_map_keyframe`` by ID with all corrections so far, 0 being the start; removed ones only with history."""
     kept = {key: frame.T_map_keyframe for key, frame in state.map.keyframes.items()}
     gone = {key: se2.compose(submap.place(), T) for key, (submap, T) in state.map.retired.items()}
     by_light = {key: submap.place() for key, submap in state.map.light_anchors.items()}
@@ -356,5 +355,5 @@ def keyframe_poses(state: State) -> dict[int, Array]:
 
 
 def render_map(state: State, resolution: float) -> Grid:
-    """Occupancy grid of all keyframes at their present places, ``resolution`` metres per cell (`live_grid.at_once`)."""
+    """Occupancy grid of all keyframes at their present poses, ``resolution`` metres per cell (`live_grid.at_once`)."""
     return live_grid.at_once(hanging(state.map.keyframes.values()), resolution)

@@ -1,4 +1,4 @@
-"""What `step` returns: a pose never comes without what is known about it."""
+"""Result types of an estimator step: pose with covariance, match, loop, links, light result, protection level."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from estimator.measurements import Job
 from estimator.numerics.arrays import Array
 
 SURPRISE: Final = 16.3
-"""Squared Mahalanobis distance (3 degrees of freedom, 99.9 %) beyond which the pose and the lights' do not agree."""
+"""Squared Mahalanobis distance (3 degrees of freedom, 99.9 %) above which the pose and the light solution disagree."""
 
 
 VAGUE: Final = np.diag((4.0, 4.0, 33.0))
-"""Information of a pose known to 0.5 m and 10 deg: what a match starts from when it is asked which axes it knows."""
+"""Information of a pose known to 0.5 m and 10 deg: the prior in the test of a match's known axes."""
 
 KNOWN: Final = np.sqrt((0.01, 0.01, 0.0012))
-"""Deviations (m, m, rad) below which an axis counts as known: 10 cm and 2 deg."""
+"""Sigma (m, m, rad) below which an axis counts as known: 10 cm and 2 deg."""
 
 
 class Reason(Enum):
-    """Why a match is, or is not, a result."""
+    """Reason why a match is valid or not."""
 
     CONVERGED = "converged"
     ITERATION_CAP = "iteration cap reached before convergence"
@@ -41,15 +41,17 @@ class Reason(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchResult:
-    """Outcome of matching one scan against the local map.
+    """Result of matching one scan against the local map.
 
     Attributes:
         T_odom_base: matched pose (the prediction where ``reason`` is not a result).
         information: 3x3 Fisher information of that pose, base-centred (x, y in m, yaw in rad).
         inliers, queries: pairs used and beams tried.
-        iterations: used. residual_m: RMS of the inliers' point-to-line distance.
-        known_axes: 3 booleans as floats (x, y, yaw) in the odom frame; 0 where this match says nothing.
-        correction: (dx, dy, dyaw) by which the match moved the prediction.
+        iterations: number used.
+        residual_m: RMS of the inliers' point-to-line distance.
+        known_axes: 3 booleans as floats (x, y, yaw) in the odom frame; 0 where this match has no information.
+        correction: (dx, dy, dyaw) of the match to the prediction.
+        reason: see `Reason`.
     """
 
     T_odom_base: Array
@@ -68,11 +70,11 @@ class MatchResult:
         return self.reason in (Reason.CONVERGED, Reason.ITERATION_CAP)
 
     def blind_directions(self) -> Array:
-        """Directions (k, 3), k = 0 to 3, of which this match says nothing, whatever way the surroundings are turned.
+        """Degenerate directions (k, 3), k = 0 to 3, of this match, for any orientation of the surroundings.
 
-        A row is a unit vector of (x, y, yaw) in the odom frame, with the three in units of 10 cm, 10 cm and 2 deg: a
-        corridor at 45 deg gives (0.71, 0.71, 0), where ``known_axes`` can only say that neither x nor y is known; a
-        round room gives the turn about its middle.
+        A row is a unit vector of (x, y, yaw) in the odom frame. Its units are 10 cm, 10 cm and 2 deg. A corridor at 45
+        deg gives (0.71, 0.71, 0), where ``known_axes`` only shows that neither x nor y is known. A round room gives the
+        rotation about its centre.
         """
         P = np.linalg.inv(self.information + VAGUE) / np.outer(KNOWN, KNOWN)
         value, vector = np.linalg.eigh(P)
@@ -80,7 +82,7 @@ class MatchResult:
 
 
 class LoopReason(Enum):
-    """Which witnesses and conditions closed a loop. The order is published: further ones go to the end."""
+    """Conditions that closed a loop. The order is published: further ones go to the end."""
 
     NEAR = "laser: the scan fits the map where it was expected"
     SEARCHED = "laser: the scan fits the map in one place of all that were possible"
@@ -94,8 +96,11 @@ class Loop:
     """An accepted loop closure between two keyframes.
 
     Attributes:
-        counter: loops accepted so far. keyframe_new, keyframe_old: the latter begins the submap that was found.
-        residual_m: root mean square distance of the beams that fit. reason: what closed it.
+        counter: loops accepted so far.
+        keyframe_new: ID of the new keyframe.
+        keyframe_old: ID of the first keyframe of the matched submap.
+        residual_m: root mean square distance of the beams that fit.
+        reason: conditions that it passed.
     """
 
     counter: int
@@ -106,13 +111,13 @@ class Loop:
 
 
 WEAK, STRONG = 3.0, 3.5
-"""Deviations below and above which a lamp is too weak, or too strong, for the place."""
+"""Sigmas below and above the expected RSS beyond which a lamp is inconsistent with the pose."""
 FITS = 2.0
-"""Deviations within which one that is not used fits the place."""
+"""Sigmas within which an unused lamp is consistent with the pose."""
 
 
 class LinkState(Enum):
-    """What one received lamp is used for, or why it is not."""
+    """Use of a received lamp, or the reason why it is not used."""
 
     ACCEPTED = "used"
     OCCLUDED = "weaker than it can be here: something stands in its way"
@@ -130,11 +135,14 @@ class Link:
     """One lamp in view, or one that should be.
 
     Attributes:
-        code: as received. lamp_id: which lamp of that code, None where that is not known.
-        amplitude: of the modulated photocurrent, A. residual: ln(received / expected), None without an expectation.
-        sigma: one sigma of that residual, of everything. gain, sigma_gain: ln of the lamp's power against the
-            survey's, common part included, as estimated so far. contradicted: what the lamp says of itself differs
-            from the survey (which wins).
+        code: as received.
+        lamp_id: lamp with that code, None where that is not known.
+        state: its use.
+        amplitude: of the modulated photocurrent, A.
+        residual: ln(received / expected), None without an expectation.
+        sigma: one sigma of that residual, from all sources.
+        gain, sigma_gain: ln of the lamp's power over the survey's, common part included, as estimated so far.
+        contradicted: whether the lamp's own data differs from the survey (which takes precedence).
     """
 
     code: int
@@ -149,20 +157,20 @@ class Link:
 
     @property
     def against(self) -> bool:
-        """Whether it speaks against the place, see :func:`speaks_against`."""
+        """Whether it is inconsistent with the pose, see :func:`speaks_against`."""
         return speaks_against(self.state, self.residual, self.sigma)
 
     @property
     def waiting(self) -> bool:
-        """Whether it fits the place and only waits to be used again, see :func:`waits`."""
+        """Whether it is consistent with the pose and only waits for use, see :func:`waits`."""
         return waits(self.state, self.residual, self.sigma)
 
 
 def speaks_against(state: LinkState, residual: float | None, sigma: float | None) -> bool:
-    """Whether what is received of a lamp speaks against the place.
+    """Whether the RSS of a lamp is inconsistent with the pose.
 
-    One that only waits to be used again does not. One that is used may: a place that has become vague because nothing
-    fitted it is no more likely than before.
+    A lamp that only waits for use is consistent. A lamp in use may be inconsistent: a large covariance after many
+    inconsistent links makes the pose no more likely.
     """
     if state not in (LinkState.ACCEPTED, LinkState.OCCLUDED) or residual is None or sigma is None:
         return state in (LinkState.OCCLUDED, LinkState.REJECTED)
@@ -170,9 +178,9 @@ def speaks_against(state: LinkState, residual: float | None, sigma: float | None
 
 
 def waits(state: LinkState, residual: float | None, sigma: float | None) -> bool:
-    """Whether a lamp that is not used is received as it should be at the place, and so speaks for it.
+    """Whether an unused lamp has the expected RSS at the pose, and so supports it.
 
-    One that was hidden is used again only after a while and some way: if the robot stands, not before it drives on.
+    A lamp that was hidden is used again only after some time and path: for a robot at rest, not before it drives on.
     """
     if state is not LinkState.OCCLUDED or residual is None or sigma is None:
         return False
@@ -180,7 +188,7 @@ def waits(state: LinkState, residual: float | None, sigma: float | None) -> bool
 
 
 class Fix(Enum):
-    """How far the position from light has come."""
+    """State of the position by light."""
 
     NONE = "no lamps in view, or too few"
     STARTING = "position known, heading and gains still being found"
@@ -192,18 +200,24 @@ class Fix(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightsResult:
-    """The `lights` filter (odometry and links, never laser) after a step: the independent witness and the paper's T_1.
+    """Result of the light filter (odometry and links, never lidar) after a step: the light solution, the paper's T_1.
 
     Attributes:
-        t_mono: instant of the latest epoch taken in, `-inf` before the first.
-        T_map_base, covariance: (x, y, yaw) and 3x3, meaningful unless fix is NONE or LOST; in AMBIGUOUS the likeliest.
-            True for ``t_pose``, which is the instant of the newest record of any kind.
-        links: strongest first. accepted: lamp IDs of the links used (the paper's S).
-        gained: 3x3 information that this step's links added to the pose beyond the prediction, and ``gained_by``: the
-            pose's correction they made; the pose takes exactly this, so that odometry is never counted twice.
-        floor: the diffuse part as estimated. block: flags of the latest sample block. clock_ppm: of the sample clock.
-        bent: how much farther than usual, and than they have long been, lamps are taken for others than was expected;
-            deviations squared, of a lamp (`model_consistency.Bent`).
+        t_mono: instant of the latest epoch in use, `-inf` before the first.
+        fix: state of the position.
+        T_map_base, covariance: (x, y, yaw) and 3x3, valid unless fix is NONE or LOST; in AMBIGUOUS the most probable.
+            They refer to ``t_pose``.
+        links: strongest first.
+        accepted: lamp IDs of the links used (the paper's S).
+        gained: 3x3 information that this step's links added to the pose beyond the prediction.
+        gained_by: the correction of the pose by them. The pose uses exactly these two, so that odometry never counts
+            twice.
+        floor: the diffuse floor as estimated.
+        block: flags of the latest sample block.
+        clock_ppm: of the sample clock.
+        t_pose: instant of the newest record of any kind.
+        bent: gain consistency: excess of the normalised squared deviation of gains and tilts, per lamp, over its usual
+            and its long-term value (`model_consistency.Bent`).
     """
 
     t_mono: float
@@ -223,10 +237,11 @@ class LightsResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Virtual:
-    """The paper's virtual consistent state components: what light alone said of the place, free of laser and drift.
+    """The paper's virtual consistent state components: the pose by light and odometry alone, without lidar or drift.
 
     Attributes:
-        T_map_base, covariance: of the `lights` filter, for the keyframe's instant. accepted: IDs of the lamps used (S).
+        T_map_base, covariance: of the light filter, for the keyframe's instant.
+        accepted: IDs of the lamps used (S).
     """
 
     T_map_base: Array
@@ -236,10 +251,11 @@ class Virtual:
 
 @dataclass(frozen=True, slots=True)
 class Protection:
-    """Bound on the error of T_map_base at the stated risk, if the place is not in doubt (`protection_level`).
+    """Protection level of T_map_base at the stated risk, if the pose is the right hypothesis (`protection_level`).
 
     Attributes:
-        horizontal_m, yaw_rad: the bounds. laser, light, wheels: what they rest on; the wheels are shared by both.
+        horizontal_m, yaw_rad: the level.
+        laser, light, wheels: solutions behind it; both of the former use odometry.
     """
 
     horizontal_m: float
@@ -251,9 +267,9 @@ class Protection:
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """By how much scans are stamped later than the wheels' readings (`time_offset`); one sigma. Both in s.
+    """Time offset of scan stamps behind odometry stamps (`time_offset`), and its sigma, both in s.
 
-    Negative: the wheels are late.
+    Negative: odometry is late.
     """
 
     lag_s: float
@@ -265,30 +281,33 @@ class StepResult:
     """The estimate after one `step`.
 
     Attributes:
-        t_mono: the instant the pose is true for (the scan's last beam, or the last record's end).
-        T_odom_base: smooth pose, never jumps. T_map_odom: absolute correction, may jump.
+        t_mono: instant of the pose (the scan's last beam, or the last record's end).
+        T_odom_base: smooth pose, never jumps.
+        T_map_odom: absolute correction, may jump.
         covariance: 3x3 of T_map_base (m, rad).
         velocity: (v_x, v_y, yaw rate) in the base frame.
         known_axes: (x, y, yaw) 1 known, 0 unknown, in the map frame.
         match: the scan match, None in a step without a scan.
-        keyframe: ID of a keyframe laid in this step, or -1. loop: accepted in this step, or None.
-        anchor, T_anchor_base: keyframe this pose hangs on and the pose relative to it (0 is the start), so that a
-            trajectory kept as anchors follows every later correction of the map.
-        jumps: how often T_map_odom moved by more than 5 cm or 1 deg at once, since the start.
-        lights: of the `lights` filter, None where there is no photodiode. placed: light has told where the map lies;
-            before that the map frame is the start pose's. gap: squared Mahalanobis distance (3 degrees of freedom)
-            between T_map_base and the lights' own at the latest epoch, None where that cannot be said.
-        apart: the two do not agree, or one of them is still on its way (`SurveyAlignment.apart`).
-        misplaced: most of the lamps that are received cannot be received at T_map_base.
-        anew: how often the local map has been begun anew because nothing fitted the old one: since then the place in
-            the map is a guess.
-        protection: bound on the error of T_map_base; None: none can be given.
-        places: None where the place in the map is known; else how many places of it fit all that was seen: 0 none yet,
-            1 one that is being confirmed.
-        aside: a stored map is set aside: light tells the place, and in that map it is still looked for. let_go: how
-            many stored maps were let go of since the start, because the robot is nowhere in them: the map is another.
-        lag: between the stamps of scans and wheels, None where none is beyond doubt.
-        jobs: work for the background worker; each answer comes back as a record of a later step.
+        keyframe: ID of a keyframe created in this step, or -1.
+        loop: accepted in this step, or None.
+        anchor, T_anchor_base: anchor keyframe (0 is the start) and the pose relative to it. A trajectory stored as
+            anchors follows every later correction of the map.
+        jumps: number of changes of T_map_odom by more than 5 cm or 1 deg at once, since the start.
+        lights: result of the light filter, None without a photodiode.
+        placed: whether the map is aligned to the survey; before that the map frame is the start pose's.
+        gap: squared Mahalanobis distance (3 degrees of freedom) of T_map_base and the light solution at the latest
+            epoch. None where one is not available.
+        apart: whether the two disagree, or one of them still converges (`SurveyAlignment.apart`).
+        misplaced: whether most of the received lamps are impossible at T_map_base.
+        anew: number of local map restarts because nothing fitted the old one: since then the pose in the map is
+            unconfirmed.
+        protection: protection level of T_map_base; None: unavailable.
+        places: None where the pose in the map is known; else the number of hypotheses: 0 none yet, 1 one under
+            confirmation.
+        aside: whether there is an unaligned map: light gives the pose, and the search in that map continues.
+        let_go: number of stored maps dropped since the start, because the robot is nowhere in them.
+        lag: time offset between the stamps of scans and odometry, None while it is not certain.
+        jobs: work for the background worker; each result returns as a record of a later step.
     """
 
     t_mono: float

@@ -1,4 +1,4 @@
-"""The state of the estimator between two steps, by owners, and its settings."""
+"""Estimator state between two steps, divided by owner, and the estimator settings."""
 
 from __future__ import annotations
 
@@ -26,22 +26,27 @@ if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
     from estimator.light_filter.light_channel import LightChannel, LightsSetup
 
 Journal = Callable[[Scan, ScanPoints, Asked | None, MatchResult], None]
-"""Takes a scan, its points, what the matcher was given (None where it was not called) and its result. It may keep all
-of them: none is changed later. It must not change anything."""
+"""Receives a scan, its points, the matcher's arguments (None where it was not called) and its result.
+
+It may keep all of them: none is changed later. It must not change anything.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Settings(MappingSettings):
-    """One set for every robot and lidar; what differs between devices comes with each scan.
+    """One set for every robot and lidar; device properties come with each scan.
 
     Attributes:
-        far_m: L of the paper's quality filter; ranges beyond it are not used.
-        quality: Q of the filter; a beam whose intensity is lower is not used (only where a scan has intensities).
-        match: the scan matcher. newest_only: it matches with the newest keyframe alone, so a keyframe is laid only a
-            whole step away from the one before, whose error stays for good.
-        light_pose: gives the light solution that a keyframe keeps, where it is not that of the pipeline's own light
-            filter; None where there is no such solution.
-        map: of the local map. matching: of the matcher. noise: of the motion.
+        far_m: L of the paper's quality filter; longer ranges are not used.
+        quality: Q of the filter; beams of lower intensity are not used (only where a scan has intensities).
+        match: the scan matcher.
+        newest_only: it matches with the newest keyframe alone. A keyframe is then created only a whole step away from
+            the previous one, because its error stays for good.
+        light_pose: returns the light solution of a keyframe, where it is not that of the pipeline's own light filter;
+            None where there is no such solution.
+        map: of the local map.
+        matching: of the matcher.
+        noise: of the motion.
     """
 
     far_m: float = 80.0
@@ -56,16 +61,19 @@ class Settings(MappingSettings):
 
 @dataclass(slots=True, eq=False)
 class State:
-    """All of it; made by :func:`new_state`, changed only by `step`.
+    """The whole state; created by :func:`new_state`, changed only by `step`.
 
     Attributes:
-        motion: the pose in the odom frame, as predicted and matched. light: decoder and light filter, the witness
-            beside the laser, moved by the same records; None where there is no photodiode.
+        settings: of the estimator.
+        map: keyframes, submap graph and live grid.
+        jobs: background work.
+        motion: the pose in the odom frame, as predicted and matched.
+        light: decoder and light filter, independent of the lidar, with the same records; None without a photodiode.
         pose: the pose in the map: T_map_odom, its anchor, and the alignment with the survey.
-        matching: what scan matching remembers. map: keyframes, submap graph and live grid.
-        relocalisation: where in the map the robot may be, while that is in doubt.
-        time_offset: between the stamps of scans and wheels. jobs: background work.
-        journal: is called with every match before it is fused, None: nobody asks.
+        matching: state of scan matching.
+        relocalisation: hypotheses of the pose in the map, while it is not known.
+        time_offset: between the stamps of scans and odometry.
+        journal: called with every match before it is fused, None without a journal.
     """
 
     settings: Settings
@@ -80,16 +88,16 @@ class State:
     journal: Journal | None = None
 
     def use(self, settings: Settings) -> None:
-        """Go on with other settings; whether a live grid is kept is decided at the start."""
+        """Continue with other settings; the live grid is decided at the start only."""
         self.settings = self.map.settings = settings
 
 
 def new_state(settings: Settings | None = None, lights: LightsSetup | None = None) -> State:
-    """A robot that has just been switched on, at the origin of its map.
+    """State at a start, at the origin of the map.
 
     Args:
         settings: default ones if None.
-        lights: the photodiode, None where there is none.
+        lights: the photodiode, None without one.
 
     Raises:
         ValueError: a stored sample clock outside the profile's range.

@@ -1,7 +1,7 @@
-"""Taking a map out of a state within a cycle, and making a state with a stored map.
+"""Map snapshot of a running state, taken within a cycle, and a new state with a stored map.
 
-:func:`image_of` only gathers references and copies places, so that it costs a cycle next to nothing; nothing that
-happens to the state later changes what it gathered.
+:func:`image_of` only collects references and copies poses, so that it costs a cycle next to nothing. Later changes of
+the state do not affect the snapshot.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
     from estimator.light_filter.light_channel import LightChannel, LightsSetup
 
 LONG_AGO_M: Final = 1000.0
-"""Metres of way by which what is restored lies behind: it is no way just driven, and counts for loops."""
+"""Path length (m) before the start at which restored submaps lie, so that they are not the path just driven."""
 
 
 def image_of(state: State, identity: Identity | None = None) -> MapImage:
-    """The map of this moment, without what is detached, or lies where only the laser has found it and is on trial.
+    """Snapshot of the present map, without detached submaps and those on trial that the lidar alone has found.
 
-    While a stored map is set aside it is that one, as it was stored.
+    Beside an unaligned map it is that map, as it was stored.
 
-    At most a millisecond.
+    It takes at most a millisecond.
     """
     graph, parts = state.map.graph, state.map.parts
     whole = graph if parts.aside is None else parts.aside
@@ -74,7 +74,7 @@ def _piece(submap: Submap) -> Piece:
 
 
 def _learned(light: LightChannel | None) -> tuple[Gains, tuple[Array, Array] | None, tuple[Lamp, ...]]:
-    """What the light filter has learned of lamps and sensors."""
+    """Gains of the lamps, sensor states and lamps that the light filter has learned."""
     if light is None:
         return {}, None, ()
     from estimator.light_filter.gain_memory import gains_known, sensors_known
@@ -83,9 +83,9 @@ def _learned(light: LightChannel | None) -> tuple[Gains, tuple[Array, Array] | N
 
 
 def restored(image: MapImage, settings: Settings | None = None, lights: LightsSetup | None = None) -> State:
-    """A robot that has just been switched on, with a map in which its place is not known yet (`MapParts.detached`).
+    """State at a start, with a map in which the robot's pose is not known yet (`MapParts.detached`).
 
-    The last pose is where it is guessed to be. Nothing of the image is changed by what the state does later.
+    The last pose is the unconfirmed pose. Later changes of the state do not affect the image.
 
     Raises:
         ValueError: as of `new_state`.
@@ -110,7 +110,7 @@ def restored(image: MapImage, settings: Settings | None = None, lights: LightsSe
 
 
 def fill(map_: MapState, image: MapImage) -> None:
-    """Fill an empty map with an image that holds submaps."""
+    """Fill an empty map with an image that contains submaps."""
     graph, parts, last = map_.graph, map_.parts, image.submaps[-1]
     for piece in image.submaps:
         way_m = piece.way_m - last.way_m - LONG_AGO_M

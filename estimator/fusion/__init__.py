@@ -1,1 +1,1 @@
-"""Motion model and published pose (Eq. 14-15): prediction, match and light combined (Tk)."""
+"""Motion model and published pose (Eq. 14-15): combines prediction, scan match and light solution (Tk)."""

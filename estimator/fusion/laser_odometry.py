@@ -1,10 +1,10 @@
-"""Where no wheels tell how the robot moves the laser does: `lights` then hears of its way, and never of its place.
+"""Lidar odometry for the light filter on robots without wheel odometry: relative motion only, never a position.
 
-A filter that sees lamps alone has to guess at the speed and at the direction in which the robot faces; what it takes a
-strength to mean is then as wrong as the guess. Matches tell the way from scan to scan to a millimetre. They are given
-to it as wheels would be, with the uncertainty of wheels: with less it would soon believe what all epochs are wrong by
-alike. So it stays what it is with wheels, a witness of the place that no map and no match has told. The way is taken
-where matches hold every axis; where they do not, as in a corridor, the filter guesses again.
+A filter of lamps alone has to estimate speed and heading; errors in them distort the meaning of each RSS. Matches give
+the motion from scan to scan to a millimetre. The light filter receives that motion with the uncertainty of wheel
+odometry. With a smaller one it would soon average errors that all epochs share. So the light solution stays independent
+of the map and of the matched position. The motion is used only where matches determine every axis. Elsewhere, as in a
+corridor, the filter estimates it again.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
     from estimator.light_filter.light_channel import LightChannel
 
 WHEELS_GONE_S: Final = 5.0
-"""Wheels that have been silent for longer are not waited for: what lamps said of their scale is given up."""
+"""Time without wheel odometry, s, after which the lidar replaces it; the learned odometry scale is then discarded."""
 
 
 def guide(light: LightChannel | None, motion: Motion, match: MatchResult) -> None:
-    """Move the light filter by the way since the scan before, after ``match`` has been fused."""
+    """Move the light filter by the motion since the previous scan, after ``match`` has been fused."""
     if light is None:
         return
     if motion.t_mono - motion.t_odometry < WHEELS_GONE_S:
         light.guided = None
         return
-    if match.reason in BLIND:  # the next one tells of the way since
+    if match.reason in BLIND:  # the next match covers the motion since
         return
     before, light.guided = light.guided, None
     if not (match.ok and match.known_axes.all() and loose_direction(match.information) is None):
@@ -42,7 +42,7 @@ def guide(light: LightChannel | None, motion: Motion, match: MatchResult) -> Non
     if before is None:
         return
     dt, made = now - before[0], se2.between(before[1], T)
-    if dt >= CARRY_S or too_far(made, dt):  # then it was carried
+    if dt >= CARRY_S or too_far(made, dt):  # no robot drives so fast: it was carried
         light.left_alone()
     else:
         light.move(Odometry(before[0], now, made), motion.velocity)

@@ -1,4 +1,4 @@
-"""Light as a witness of the pose: whether it holds the place now, and what it says of it by itself."""
+"""Light solution at the present pose: virtual components for keyframes, availability and convergence of light."""
 
 from __future__ import annotations
 
@@ -19,18 +19,22 @@ if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
     from estimator.light_filter.light_channel import LightChannel
 
 BLIND_S, BLIND_PERIODS, SLOWEST_S = 0.5, 1.5, 3.0
-"""Without a match for so long, or so many scan periods (of a slow laser), light and odometry are all there is."""
+"""Time (s, or scan periods of a slow lidar) without a match, after which there is no lidar update.
+
+SLOWEST_S limits the learned scan period, s.
+"""
 KNOWN = np.array((0.15**2, 0.15**2, 0.1**2))
-"""Variances (m^2, m^2, rad^2) below which an axis of the pose in the survey's frame counts as known."""
+"""Variances (m^2, m^2, rad^2) below which an axis of the pose in the survey frame is known."""
 SILENT_PERIODS = 2.5
-"""Nor does light that has been silent for so many epochs, where these come slowly; see `SILENT_S`."""
+"""Epoch periods after which light without used links is timed out, where epochs come slowly; see `SILENT_S`."""
 
 
 def virtual(pose: MapPose, motion: Motion, light: LightChannel | None) -> Virtual | None:
-    """What light alone says of the place just now, as far as the map may rely on it; None where it says nothing good.
+    """Light solution at the present instant, as far as the map may rely on it; None where it is not valid.
 
-    What it does not know it must not say: a row of lamps would turn the map to and fro, so that its far end moved by
-    metres between two laps; and without wheels the heading may have settled the wrong way round.
+    Unknown directions get a large covariance. Otherwise collinear lamps would rotate the map back and forth. Its far
+    end would move by metres between two laps. Without odometry the heading may have converged to the opposite
+    direction.
     """
     alignment = pose.alignment
     if alignment is None or light is None or light.result.fix is not Fix.GOOD:
@@ -40,7 +44,7 @@ def virtual(pose: MapPose, motion: Motion, light: LightChannel | None) -> Virtua
     _, factor = doubted_covariance(lights, alignment.way - alignment.way_young, wheels, alignment.row.narrow(BESIDE_M))
     T_odom_base = pose_at(pose, motion, max(lights.t_mono, lights.t_pose))
     T_map_base = lights.T_map_base.copy()
-    if not wheels:  # the pose's heading is the better guess, by which the submap's origin is found from here
+    if not wheels:  # the pose's heading is more accurate; the submap's origin is found with it
         lights = without_heading(lights)
         T_map_base[2] = se2.compose(pose.T_map_odom, T_odom_base)[2]
     T_map_base = se2.compose(T_map_base, se2.between(T_odom_base, motion.T_odom_base))
@@ -48,10 +52,10 @@ def virtual(pose: MapPose, motion: Motion, light: LightChannel | None) -> Virtua
 
 
 def restarting(light: LightChannel, lights: LightsResult) -> bool:
-    """Whether light is only just finding its place, so that gains are not known yet.
+    """Whether light has only begun to find its position, so that gains are not known yet.
 
-    A heading that has become vague since, as that of a robot that stands where no wheels say so, and a stretch between
-    two lamps leave the gains known.
+    Gains stay known while only the heading has become uncertain, or between two lamps. An example is a robot at rest
+    without odometry.
     """
     if lights.fix in (Fix.GOOD, Fix.HELD):
         return False
@@ -60,10 +64,10 @@ def restarting(light: LightChannel, lights: LightsResult) -> bool:
 
 
 def holds_heading(pose: MapPose, motion: Motion, light: LightChannel | None) -> bool:
-    """Whether the laser holds a heading that light has proved, and light has nothing as good.
+    """Whether the lidar tracks a heading that light has confirmed, and the light filter has no odometry.
 
-    Without wheels the `lights` filter takes a robot to drive the way it faces, and its heading may settle the wrong way
-    round whenever the robot is slow; the laser does not turn round.
+    Without odometry the light filter assumes that the robot drives forwards. At low speed its heading may converge to
+    the opposite direction. The lidar does not have that ambiguity.
     """
     alignment = pose.alignment
     assert alignment is not None
@@ -76,14 +80,14 @@ def holds_heading(pose: MapPose, motion: Motion, light: LightChannel | None) -> 
 
 
 def blind(pose: MapPose, motion: Motion) -> bool:
-    """Whether the laser has not told anything lately, though a scan was due."""
+    """Whether matches are overdue, though a scan was due."""
     alignment = pose.alignment
     assert alignment is not None
     return motion.t_mono - alignment.t_match > max(BLIND_S, BLIND_PERIODS * alignment.scan_s)
 
 
 def light_holds(pose: MapPose, motion: Motion, light: LightChannel | None) -> bool:
-    """Whether light has told the place and goes on telling; lamps that went out hold nobody where they once did."""
+    """Whether light has given the position and still has used links; lamps that went out determine nothing."""
     alignment = pose.alignment
     if alignment is None or light is None or not alignment.placed:
         return False
@@ -91,14 +95,14 @@ def light_holds(pose: MapPose, motion: Motion, light: LightChannel | None) -> bo
 
 
 def last_used(light: LightChannel | None) -> float:
-    """When a link was used for the last time; -inf without a photodiode."""
+    """Instant (s) of the last use of a link; -inf without a photodiode."""
     return -math.inf if light is None else light.filter.t_used
 
 
 def pose_at(pose: MapPose, motion: Motion, t_mono: float) -> Array:
-    """T_odom_base at an instant of the last second, at constant twist between two predictions; the ends are held."""
+    """T_odom_base at an instant of the last second: at constant twist between predictions, constant beyond the ends."""
     assert pose.alignment is not None
     poses, after = pose.alignment.poses, (motion.t_mono, motion.T_odom_base)
-    if poses.poses and poses.poses[-1][0] > after[0]:  # at a late scan, the pose is taken back
+    if poses.poses and poses.poses[-1][0] > after[0]:  # during a late scan the pose lies in the past
         after = poses.poses[-1]
     return after[1] if t_mono >= after[0] else poses.at(t_mono, after)

@@ -1,14 +1,15 @@
-"""Where the odom frame lies in the survey: light corrects T_map_odom, and T_odom_base is not changed.
+"""Schmidt-Kalman filter of T_map_odom: light corrects the alignment with the survey and leaves T_odom_base unchanged.
 
-What is estimated is the error of ``T_map_base`` with its covariance ``P`` and with its covariance ``X`` with the error
-of ``T_odom_base`` against the local map (whose own covariance is ``Motion.P``). Both errors grow by the same motion, so
-a scan that mends the one mends the other as far as ``X`` says; what light has mended already is not mended twice. A
-gain of zero for ``T_odom_base`` keeps it smooth and free of light (a Schmidt-Kalman filter). In a corridor the long
-axis so comes from light, in a room the laser holds the pose and light finds where the map lies.
+The state is the error of ``T_map_base`` with its covariance ``P``. ``X`` is its covariance with the error of
+``T_odom_base`` against the local map, whose own covariance is ``Motion.P``. Both errors grow by the same motion, so a
+scan that corrects one corrects the other according to ``X``. What light has already corrected is not corrected twice. A
+gain of zero for ``T_odom_base`` keeps it smooth and independent of light. So in a corridor the long axis comes from
+light. In a room the lidar tracks the pose, and light aligns the map.
 
-The `lights` filter uses the same odometry. Therefore only what its links have *added* is taken (`LightsResult.gained`,
-a channel filter), and no more than one filter's worth for each stretch or time over which the error of its own model
-stays the same: without that, a robot at rest would average the same wall reflection until it believed it.
+The light filter uses the same odometry. Therefore only the information that its links have *added* enters
+(`LightsResult.gained`, a channel filter). Each segment of path or time with the same model error contributes the
+information of one filter at most. Otherwise a robot at rest would average one wall reflection until its covariance
+vanished.
 """
 
 from __future__ import annotations
@@ -46,8 +47,9 @@ class MapShift:
     """A correction of the map frame that the map has to follow.
 
     Attributes:
-        moved: what is in the map moves by this (x, y, yaw; T_new_old). since: ID of the first keyframe that moves.
-            known: the place in the survey is known for the first time: a restored map comes along for the last time.
+        moved: transform of the map contents (x, y, yaw; T_new_old).
+        since: ID of the first keyframe that moves.
+        known: the pose in the survey is known for the first time: a restored map moves along for the last time.
     """
 
     moved: Array
@@ -56,35 +58,45 @@ class MapShift:
 
 
 FRESH_M, FRESH_S = 0.7, 60.0
-"""Way and time after which the error of the light model (walls, floor, lamps) is another one."""
+"""Path length (m) and time (s) after which the error of the light model (walls, ground, lamps) is independent."""
 
 DRIFT = (5e-5, 5e-5, 2e-6)
-"""Variance per metre (m^2, m^2, rad^2) by which a map laid by matching bends beyond what the matches know of: some
-7 mm and 0.08 deg by the root of the way."""
+"""Variance per metre (m^2, m^2, rad^2) of map deformation beyond the covariance of matches.
+
+It is some 7 mm and 0.08 deg per root of a metre.
+"""
 
 ASTRAY_RAD = 0.35
-"""A heading from light that is off by so much, without wheels, has led its position astray too."""
+"""Heading error of light, without odometry, above which its position is wrong as well, rad."""
 SURPRISE_S = 1.0
-"""Light that is sure and disagrees for longer is believed: nothing else knows where in the building the robot is."""
+"""Time (s) of disagreement after which a certain light solution is followed.
+
+Only light can find the position in the building.
+"""
 TOLERANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
-"""What stamps and lever arms make of a moving robot."""
+"""Covariance of stamp and lever arm errors of a moving robot."""
 
 APART = 1.5
-"""Squared Mahalanobis distance above which a pose is still on its way to where light is, or light to it. The errors of
-a pose that comes from light are mostly light's own: at 150 starts it was 0.1 (median), at one of fifty above 0.8, and
-not 3 as between two that know nothing of one another; of the four above 1.5 three were wrong."""
+"""Squared Mahalanobis distance above which pose and light are still converging to each other.
+
+The errors of a pose that comes from light are mostly light's own. At 150 starts the distance was 0.1 (median), and
+above 0.8 at one in fifty; two independent poses would give 3. Of the four above 1.5 three were wrong.
+"""
 FAR_M, FAR_RAD, CHECKED = 1.5, 0.5, 3
-"""While the laser has held the pose without a break, light that is off by less is told, not followed: the laser does
-not lose so little, and light that reflects in an unusual place is off by as much; nor, where the pose is known, is
-light of fewer lamps: one of two that hangs elsewhere takes the place along."""
+"""Separation (m, rad) of light above which it is followed although the lidar has tracked without a break.
+
+A smaller one is reported only. The lidar does not lose so little, and light with an unusual reflection deviates by as
+much. CHECKED: fewest lamps for this where the pose is known, because one of two lamps that was moved shifts the
+position.
+"""
 SAID = np.diag((0.3**2, 0.3**2, 0.15**2))
-"""Covariance of a pose that a person gives."""
+"""Covariance of an operator pose."""
 SURER = 0.25
-"""Share of the pose's generalised variance below which the lights' is taken as it is."""
+"""Share of the pose's generalised variance below which the light solution replaces it."""
 
 
 def on_motion(pose: MapPose, motion: Motion, T_before: Array, P_before: Array, t_before: float) -> None:
-    """Let the uncertainty of the alignment grow by the motion that has just been predicted."""
+    """Propagate the covariance of the alignment by the motion that has just been predicted."""
     alignment = pose.alignment
     if alignment is None:
         return
@@ -106,14 +118,14 @@ def on_motion(pose: MapPose, motion: Motion, T_before: Array, P_before: Array, t
 
 
 def on_match(pose: MapPose, motion: Motion, t_scan: float, before: tuple[Array, Array], lacked: Array) -> None:
-    """Correct T_map_base by as much of the match's correction of T_odom_base as was its own error too.
+    """Correct T_map_base by the part of the match's correction of T_odom_base that was its own error too.
 
     Args:
         pose: in the map.
         motion: after the match.
-        t_scan: instant of the scan before, s.
+        t_scan: instant of the previous scan, s.
         before: T_odom_base and its covariance before the match.
-        lacked: covariance (3, 3) that the prediction's lacked (`estimator.fusion.motion_model.learn`).
+        lacked: covariance (3, 3) that the prediction lacked (`estimator.fusion.motion_model.learn`).
     """
     alignment, (T_before, P_before) = pose.alignment, before
     if alignment is None:
@@ -134,7 +146,7 @@ def on_match(pose: MapPose, motion: Motion, t_scan: float, before: tuple[Array, 
 
 
 def remember(pose: MapPose, motion: Motion) -> None:
-    """Remember how surely the map lies in the survey: see `SurveyAlignment.kept`."""
+    """Store the pose and the covariance of the alignment: see `SurveyAlignment.kept`."""
     alignment, R = pose.alignment, se2.rotation(pose.T_map_odom[2])
     assert alignment is not None
     alignment.kept = se2.compose(pose.T_map_odom, motion.T_odom_base), R @ alignment.P @ R.T
@@ -143,7 +155,7 @@ def remember(pose: MapPose, motion: Motion) -> None:
 def on_lights(
     pose: MapPose, motion: Motion, light: LightChannel, lights: LightsResult, next_key: int
 ) -> MapShift | None:
-    """Take in a result of the light filter; returns by what the map is to be moved with the robot, if it is.
+    """Update by a result of the light filter; returns the shift of the map with the robot, if there is one.
 
     ``next_key``: ID of the next keyframe.
     """
@@ -171,7 +183,7 @@ def on_lights(
     alignment.gap = float(off @ invert3(P + lights.covariance + TOLERANCE) @ off) if alignment.placed else None
     if (
         not alignment.placed or alignment.odd_since is not None or held
-    ):  # held: what light says of the heading is not used
+    ):  # while the lidar tracks the heading, that of light is not used
         alignment.swing.forget()
     elif lights.fix is Fix.GOOD:
         alignment.swing.take(alignment.way, float(lights.T_map_base[2] - T_odom_base[2]))
@@ -192,7 +204,7 @@ def on_lights(
 
 
 def on_order(pose: MapPose, motion: Motion, light: LightChannel | None, command: Command) -> None:
-    """What a person orders holds for light too: it looks about the given pose, or begins anew."""
+    """Apply an operator command to the light filter: a given pose, or a restart."""
     alignment, T_map_base = pose.alignment, command.T_map_base
     if alignment is None or light is None or command.order is Order.REMEMBERED:
         return
@@ -225,7 +237,7 @@ def on_order(pose: MapPose, motion: Motion, light: LightChannel | None, command:
 
 
 def place_given(alignment: SurveyAlignment, by_map: bool) -> None:
-    """A person, or the map, has told the place: what light and pose were to each other before is no matter."""
+    """Reset the comparison with light after an operator or the map has given the pose."""
     alignment.apart, alignment.by_map = False, by_map
     alignment.swing.forget()
 
@@ -233,16 +245,16 @@ def place_given(alignment: SurveyAlignment, by_map: bool) -> None:
 def gain(
     pose: MapPose, motion: Motion, wheels: bool, news: tuple[LightsResult, Array, Array], next_key: int
 ) -> MapShift:
-    """Add the information that the epoch's links have added to the `lights` filter, as far as it is news.
+    """Add the information that the epoch's links have added to the light filter, as far as it is new.
 
-    The links' own measurement, stripped of what the `lights` filter knew before, is ``L+ x+ - L- x-``; about the pose
-    here that is ``G (x- - x) + L+ dx`` with ``G = L+ - L-`` and the correction ``dx`` that they made.
+    The links' own measurement, without the prior of the light filter, is ``L+ x+ - L- x-``. About the pose here that is
+    ``G (x- - x) + L+ dx`` with ``G = L+ - L-`` and the correction ``dx`` that they made.
 
     Args:
         pose: in the map.
         motion: in the odom frame.
-        wheels: whether wheels move the light filter.
-        news: the epoch's result, T_odom_base at its instant, and by how much (x, y, yaw) light is off the pose then.
+        wheels: whether odometry drives the light filter.
+        news: the epoch's result, T_odom_base at its instant, and the difference (x, y, yaw) of light to the pose then.
         next_key: ID of the next keyframe.
     """
     alignment, (lights, T_odom_base, off) = pose.alignment, news
@@ -251,7 +263,7 @@ def gain(
     L_lights = invert3(lights.covariance)
     most = largest_of(lights.gained, lights.covariance)
     part = min(1.0, alignment.fresh / most) if most > 0.0 and not blind(pose, motion) else 1.0
-    alignment.fresh = max(0.0, alignment.fresh - part * max(most, 0.0))  # blind, more is taken than has come fresh
+    alignment.fresh = max(0.0, alignment.fresh - part * max(most, 0.0))  # may exceed what is new
     G = part * lights.gained
     told = G @ (off - lights.gained_by) + part * (L_lights @ lights.gained_by)
     if not wheels:
@@ -270,7 +282,7 @@ def gain(
 
 
 def follow(pose: MapPose, motion: Motion, lights: LightsResult, T_odom_base: Array) -> MapShift:
-    """Take the lights' pose as it is."""
+    """Set the pose to the light solution."""
     alignment = pose.alignment
     assert alignment is not None
     pose.history.forget()
@@ -284,7 +296,7 @@ def follow(pose: MapPose, motion: Motion, lights: LightsResult, T_odom_base: Arr
 
 
 def hang_on_anchor(pose: MapPose, motion: Motion) -> None:
-    """The pose is as sure as its anchor, swung out to here, and the way since: the map has told it, not light."""
+    """Set the alignment's covariance to that of the anchor, propagated to here: the pose then comes from the map."""
     alignment, P = pose.alignment, np.empty((3, 3))
     assert alignment is not None
     hang(pose.T_odom_anchor, motion.T_odom_base, pose.P_anchor, motion.P, 0.0, P)
@@ -293,7 +305,7 @@ def hang_on_anchor(pose: MapPose, motion: Motion) -> None:
 
 
 def leave(pose: MapPose, motion: Motion, keep: Array) -> None:
-    """Of the alignment's error, and so of what it shares with the pose's, ``keep`` (3x3, odom-aligned axes) is left."""
+    """Scale the alignment's error, and its covariance with the pose's, by ``keep`` (3x3, odom-aligned axes)."""
     alignment, now = pose.alignment, motion.t_mono
     assert alignment is not None
     alignment.X = keep @ alignment.X
@@ -303,9 +315,9 @@ def leave(pose: MapPose, motion: Motion, keep: Array) -> None:
 
 
 def correct(pose: MapPose, T_map_base: Array, T_odom_base: Array, T_odom_now: Array) -> MapShift:
-    """Move the robot, at ``T_odom_now`` by now, so that it was at ``T_map_base`` when it was at ``T_odom_base``.
+    """Move the map frame so that the robot, now at ``T_odom_now``, was at ``T_map_base`` when at ``T_odom_base``.
 
-    What was laid since the pose was last known is to come along, what is older stays where it is.
+    Keyframes created since the pose was last known move along; older ones stay.
     """
     assert pose.alignment is not None
     T_map_odom = se2.compose(T_map_base, se2.inverse(T_odom_base))
@@ -315,10 +327,11 @@ def correct(pose: MapPose, T_map_base: Array, T_odom_base: Array, T_odom_now: Ar
 
 
 def _contradicted(pose: MapPose, motion: Motion, light: LightChannel, lights: LightsResult, off: Array) -> bool:
-    """Whether light has disagreed with the pose for long enough, and by enough, to be believed.
+    """Whether light has disagreed with the pose for long enough, and by enough, to be followed.
 
-    Light that looks, or is off by less than the laser could have lost, says nothing against a proved pose held since;
-    nor does one lamp beside a row of others, seen for a moment: what the row has led astray it does not put right.
+    A light filter that still searches does not contradict a confirmed pose under tracking. Nor does a difference
+    smaller than the lidar could have lost. Nor does one lamp beside collinear others, seen briefly: it does not correct
+    the error that they have caused.
     """
     alignment = pose.alignment
     assert alignment is not None
@@ -338,9 +351,9 @@ def _contradicted(pose: MapPose, motion: Motion, light: LightChannel, lights: Li
 
 
 def _apart(alignment: SurveyAlignment) -> bool:
-    """Whether pose and light do not agree, or do and one of them is still on its way to the other.
+    """Whether pose and light disagree, or agree while one still converges to the other.
 
-    A pose that the map has told shares nothing with light, and they are as far apart as chance will have it.
+    A pose from the map is independent of light, so their distance varies randomly.
     """
     assert alignment.gap is not None
     if alignment.odd_since is not None or alignment.by_map:
@@ -349,10 +362,10 @@ def _apart(alignment: SurveyAlignment) -> bool:
 
 
 def _elsewhere(pose: MapPose, motion: Motion, light: LightChannel) -> bool:
-    """Whether light has had to look for its place anew since it last agreed, or a lamp cannot be received here.
+    """Whether light has restarted its position search since the last agreement, or receives an impossible lamp.
 
-    Else it is its heading that wheels have led away, or that a row of lamps has left open: the laser holds its own, and
-    nothing that is received speaks against the place.
+    Otherwise odometry or collinear lamps have biased only its heading. The lidar tracks its own heading, and no link
+    contradicts the position.
     """
     assert pose.alignment is not None
     assert light is not None
@@ -364,5 +377,5 @@ def _elsewhere(pose: MapPose, motion: Motion, light: LightChannel) -> bool:
 
 
 def _surer(alignment: SurveyAlignment, lights: LightsResult) -> bool:
-    """Whether the lights' pose is so much better known that nothing is lost by taking it as it is."""
+    """Whether the covariance of the light solution is so much smaller that it can replace the pose."""
     return alignment.odd_since is None and det3(lights.covariance) < SURER * det3(alignment.P)

@@ -1,4 +1,4 @@
-"""T_map_odom as it was a while ago: what light, under test since, is compared with (solution separation)."""
+"""T_map_odom history: two earlier corrections, from which the lidar solution of the solution separation starts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 from estimator.numerics.arrays import Array
 
 SPACING_M: Final = 10.0
-"""Way between two snapshots: the older one in use is between one and two times as old."""
+"""Path length between two snapshots, m: the age of the older one is between one and two times that."""
 
 
 @dataclass(slots=True)
@@ -16,7 +16,7 @@ class MapOdomHistory:
     """At most two snapshots, the older first.
 
     Attributes:
-        kept: T_map_odom, covariance of the pose (3, 3; map axes) and metres driven, of then.
+        kept: T_map_odom, covariance of the pose (3, 3; map axes) and path length (m) of each snapshot.
     """
 
     kept: list[tuple[Array, Array, float]] = field(default_factory=list)
@@ -28,5 +28,5 @@ class MapOdomHistory:
             del self.kept[:-2]
 
     def forget(self) -> None:
-        """The place was found anew: what was before says nothing."""
+        """Remove the snapshots, after the pose was found again."""
         self.kept.clear()

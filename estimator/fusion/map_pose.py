@@ -1,4 +1,4 @@
-"""The published pose in the map: T_map_odom, the anchor that the pose hangs on, and the alignment with the survey."""
+"""The published pose in the map: T_map_odom, its anchor keyframe, and the alignment with the lamp survey."""
 
 from __future__ import annotations
 
@@ -17,35 +17,44 @@ from estimator.numerics.covariance3 import hang, turn
 from estimator.numerics.pose_history import PoseHistory
 
 MEMORY_S = 1.0
-"""How late a light epoch may come."""
+"""Largest delay of a light epoch, s."""
 
 JUMP_M, JUMP_RAD = 0.05, math.radians(1.0)
 
 
 @dataclass(slots=True, eq=False)
 class SurveyAlignment:
-    """Where the odom frame lies in the light survey's frame, by light and by matches.
+    """Alignment of the odom frame with the survey frame, from light and matches.
 
     Attributes:
-        placed: light has told where the map lies. proved: it was sure of that, or a person said so. broken: the laser
-            has let go of the pose since, or begun its map anew.
-        P, X: see above, both 3x3, odom-aligned axes. kept: T_map_base, and P in map axes, at the latest match, or
-            when light or a person said where the map lies; what P has grown by since is of the way, not of the map.
-        gap: squared Mahalanobis distance between the pose and the lights' at the latest epoch, None: either is unknown.
-        apart: at the latest epoch that told the place they did not agree, or one was on its way to the other.
-        by_map: the pose comes from the map that the robot was found in, not from light.
-        odd_since: since when they disagree. doubted_at: when that was last no reason to follow light. unheard: the
-            laser has found the place while the `lights` filter held another one, and they have not agreed since.
-        elsewhere_since: since when what is received does not fit the place. aside_since: nor each epoch alone.
-        way, way_young: driven so far, and when light last began to find the place. way_start: of the `lights` filter,
-            the start that has led to the place on which the two last agreed.
-        fresh: how much of the lights' information may be taken, 0 to 1; grows with way and time.
-        since: ID of the first keyframe laid after the pose was known for the last time.
-        t_match: instant of the latest match; scan_s: what had passed since the scan before it.
-        t_light: instant of the latest epoch, whatever was in it; light_s: what had passed since the one before it.
+        placed: light has given the alignment.
+        proved: it did so with a valid fix, or an operator gave the pose.
+        broken: since then lidar tracking has had a gap or a local map restart.
+        P, X: covariances of `estimator.fusion.map_odom_filter`, both 3x3, odom-aligned axes.
+        kept: T_map_base, and P in map axes, at the latest match, or when light or an operator gave the alignment.
+            Growth of P since then belongs to the motion, not to the map.
+        gap: squared Mahalanobis distance between the pose and the light solution at the latest epoch, None: one is
+            unknown.
+        apart: at the latest epoch with a position they disagreed, or one was still converging to the other.
+        by_map: the pose comes from a match in the map, not from light.
+        odd_since: instant since which they disagree, s.
+        doubted_at: latest instant at which the disagreement gave no reason to follow light, s.
+        unheard: the lidar has found the pose while the light filter had another one, and they have not agreed since.
+        elsewhere_since: instant since which the links do not fit the pose, s.
+        aside_since: instant since which no single epoch fits it either, s.
+        way: path length so far, m.
+        way_young: path length at which light last began to find its position, m.
+        way_start: `way_start` of the light filter when the two last agreed.
+        fresh: usable share of the information from light, 0 to 1; grows with path length and time.
+        since: ID of the first keyframe created after the pose was last known.
+        t_match: instant of the latest match, s.
+        scan_s: its distance from the previous scan, s.
+        t_light: instant of the latest epoch, with or without links, s.
+        light_s: its distance from the previous one, s.
         poses: T_odom_base of the last second.
-        swing: the heading of the odom frame by light over the last stretch of way. row: what a row of lamps leaves.
-        mended: when light has mended the pose in the last seconds, and what part (3x3, odom axes) of its error is left.
+        swing: heading of the odom frame by light over the last segment of the path.
+        row: extra covariance of collinear lamps.
+        mended: instants of the latest corrections by light, each with the remaining part (3x3, odom axes) of the error.
     """
 
     placed: bool = False
@@ -82,11 +91,12 @@ class MapPose:
     """The pose in the map, apart from the motion in the odom frame.
 
     Attributes:
-        T_map_odom: absolute correction; changed by :meth:`move` alone. jumps: see `StepResult`.
-        alignment: with the survey's frame, None where there is no photodiode.
-        history: T_map_odom of a while ago, that light is compared with.
-        anchor, T_odom_anchor, P_anchor: newest keyframe, where it was laid, and the covariance (3, 3; odom axes) of its
-            place in the map; 0 and the origin at the start.
+        T_map_odom: absolute correction; changed by :meth:`move` alone.
+        jumps: see `StepResult`.
+        alignment: with the survey frame, None without a photodiode.
+        history: earlier T_map_odom, for solution separation.
+        anchor, T_odom_anchor: newest keyframe and its pose when created; 0 and the origin at the start.
+        P_anchor: covariance (3, 3; odom axes) of its position in the map.
     """
 
     T_map_odom: Array = field(default_factory=se2.identity)
@@ -98,7 +108,7 @@ class MapPose:
     P_anchor: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def move(self, T_map_odom: Array, T_odom_base: Array) -> None:
-        """Correct the map frame under the robot at ``T_odom_base``; the robot's own move says whether it was a jump."""
+        """Set the map frame with the robot at ``T_odom_base``; counts a jump by the displacement of the robot."""
         was = se2.compose(self.T_map_odom, T_odom_base)
         x, y, yaw = se2.between(was, se2.compose(T_map_odom, T_odom_base)).tolist()
         self.jumps += int(math.hypot(x, y) > JUMP_M or abs(yaw) > JUMP_RAD)
@@ -109,9 +119,9 @@ class MapPose:
         return se2.compose(self.T_map_odom, T_odom_base)
 
     def covariance(self, T_odom_base: Array, P_odom: Array) -> Array:
-        """3x3 covariance of T_map_base: of the anchor, carried to here, and of the pose relative to it, ``P_odom``.
+        """3x3 covariance of T_map_base: of the anchor, propagated to here, and of the pose relative to it, ``P_odom``.
 
-        Once light has told where the map lies it is that of the place in the survey's frame instead.
+        Once light has given the alignment it is that of the pose in the survey frame instead.
         """
         out, yaw = np.empty((3, 3)), float(self.T_map_odom[2])
         if self.alignment is not None and self.alignment.placed:

@@ -1,8 +1,8 @@
-"""The way of the last two seconds, so that a scan that comes late is matched where the robot was when it was true.
+"""Motion of the last two seconds, to match a late scan at the pose of its own instant.
 
-A scan is late when the line or the computer has held it up: what else has arrived has carried the pose on meanwhile.
-Matched at the present pose it would drag that back by the way driven since. So the pose is taken back along the trail
-(:func:`go_back`), the scan is matched, fused and kept there, and the pose is carried on again (:func:`come_again`).
+The line or the computer can delay a scan, while other records have moved the pose on. A match at the present pose would
+pull it back by the path since. So the pose moves back along the history (:func:`go_back`). The scan is matched and
+fused there, and the pose is propagated to the present again (:func:`come_again`).
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import det3
 
 LATE_S = 0.05
-"""Age of a scan's end, against the pose, from which on it is matched where the robot was then: stamps of different
-devices are no more even than that."""
+"""Delay of a scan's end behind the pose, s, from which it is late: stamps of different devices vary by that much."""
 KEPT_S = 2.0
-"""How far back the way is known: a scan that is older is not matched."""
+"""Length of the history, s: an older scan is not matched."""
 ANOTHER_CLOCK_S = 10.0
-"""No scan is held up for so long: its clock has been set back, or the pose has once been carried to a wrong instant. It
-is matched at the present pose, which is all that is known."""
+"""Delay, s, above which the scan's clock was set back, or the pose was once predicted to a wrong instant.
+
+Such a scan is matched at the present pose, the only one available.
+"""
 STRETCH_S = 0.02
-"""Motions are put together up to this length; readings may come a thousand times a second."""
+"""Motions are merged up to this length, s; readings may come a thousand times a second."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """A motion ``delta`` made over ``[t_begin, t_end]``, in the base frame at its begin, with its variance (x, y, yaw).
+    """A motion ``delta`` over ``[t_begin, t_end]``, in the base frame at its begin, with its variance (x, y, yaw).
 
-    Between two stretches the pose has stood.
+    Between two of them the pose is constant.
     """
 
     t_begin: float
@@ -44,18 +45,18 @@ class Stretch:
 
 @dataclass(slots=True, eq=False)
 class Trail:
-    """Stretches of the last :data:`KEPT_S` seconds, in order of time; t_first: from when on none is missing."""
+    """Motion of the last :data:`KEPT_S` seconds, in order of time; complete from ``t_first`` on."""
 
     t_first: float = math.inf
     stretches: deque[Stretch] = field(default_factory=deque)
 
     def forget(self, t_first: float) -> None:
-        """Nobody knows what was before."""
+        """Clear the history; it begins at ``t_first``."""
         self.stretches.clear()
         self.t_first = t_first
 
     def add(self, t_begin: float, t_end: float, delta: Array, variance: Array) -> None:
-        """Append a motion, and let go of what is too old."""
+        """Append a motion, and remove what is too old."""
         if not (math.isfinite(t_begin) and t_end > t_begin):
             return
         self.t_first = min(self.t_first, t_begin)
@@ -68,7 +69,7 @@ class Trail:
             self.t_first = self.stretches.popleft().t_end
 
     def take_back(self, t_mono: float) -> None:
-        """Drop what was made after an instant: somebody knows it better."""
+        """Remove the motion after an instant, which a better measurement replaces."""
         before: Stretch | None = None
         while self.stretches and self.stretches[-1].t_end > t_mono:
             last = self.stretches.pop()
@@ -78,7 +79,7 @@ class Trail:
             self.stretches.append(before)
 
     def since(self, t_mono: float) -> list[Stretch] | None:
-        """What was made after an instant, None where that is not known any more."""
+        """The motions after an instant, None where they are no longer available."""
         if t_mono < self.t_first:
             return None
         found: list[Stretch] = []
@@ -90,21 +91,22 @@ class Trail:
 
 
 def _part(stretch: Stretch, t_begin: float, t_end: float) -> Stretch:
-    """The part of a stretch that lies within ``[t_begin, t_end]``, at constant twist."""
+    """The part of a motion within ``[t_begin, t_end]``, at constant twist."""
     share = (t_end - t_begin) / (stretch.t_end - stretch.t_begin)
     return Stretch(t_begin, t_end, se2.fraction(stretch.delta, share), stretch.variance * share)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ahead:
-    """What lies between a late scan and now.
+    """Motion between a late scan and the present.
 
     Attributes:
-        t_mono: now. delta: motion since, in the base frame of then. Q: 3x3 covariance of what it has added, in the axes
-            of that frame, about the place of now.
-        shared: 3x3, of what it has added with the error of the tie, likewise.
-        known: whether ``Q`` was a part of the pose's covariance, and has been taken out of it.
-        velocity, velocity_variance: as known now.
+        t_mono: the present instant.
+        delta: motion since the scan, in the base frame then.
+        Q: 3x3 covariance that it has added, in the axes of that frame, about the present position.
+        shared: 3x3 covariance of that addition with the error of the survey alignment, likewise.
+        known: whether ``Q`` was a part of the pose's covariance, and has been subtracted from it.
+        velocity, velocity_variance: at the present instant.
     """
 
     t_mono: float
@@ -117,7 +119,7 @@ class Ahead:
 
 
 def made(stretches: list[Stretch]) -> tuple[Array, Array]:
-    """Motion over all stretches and its covariance (3, 3), both in the base frame before the first."""
+    """Motion over all segments and its covariance (3, 3), both in the base frame before the first."""
     delta, Q = se2.identity(), np.zeros((3, 3))
     for stretch in stretches:
         R = se2.rotation(delta[2] + 0.5 * stretch.delta[2])
@@ -127,11 +129,11 @@ def made(stretches: list[Stretch]) -> tuple[Array, Array]:
 
 
 def turned(Q: Array, yaw: float) -> Array:
-    """A covariance in axes that are turned by ``yaw`` against its own."""
+    """A covariance in axes rotated by ``yaw`` from its own."""
     R = se2.rotation(yaw)
     return np.asarray(R @ Q @ R.T)
 
 
 def positive(P: Array) -> bool:
-    """Whether a 3x3 covariance leaves no direction without an error."""
+    """Whether a 3x3 covariance is positive definite."""
     return bool(P[0, 0] > 0.0 and P[0, 0] * P[1, 1] > P[0, 1] * P[1, 0] and det3(P) > 0.0)

@@ -1,7 +1,7 @@
-"""The prediction: from odometry, gyro or constant velocity, to the instant of each record.
+"""Motion model: predicts the pose from odometry, gyro or constant velocity to the instant of each record.
 
-Odometry says what happened up to its own stamp. When a scan is newer, the pose is carried ahead by the velocity, and
-that carry (``ahead``) is taken back as soon as odometry for the same stretch arrives; so no motion is counted twice,
+Odometry describes the motion up to its own stamp. For a newer scan the velocity extrapolates the pose. That
+extrapolation (``ahead``) is subtracted when odometry for the same interval arrives. So no motion is counted twice,
 whatever the order and the quality of the stamps.
 """
 
@@ -20,33 +20,35 @@ from estimator.numerics.covariance3 import carry_on, feel_axes
 from estimator.numerics.symmetric3 import invert3
 
 LONGEST_CARRY_S = 0.5
-"""Beyond this a velocity says nothing any more; the pose is held and the uncertainty grows instead."""
+"""Longest extrapolation, s; then the pose is kept constant and only its covariance grows."""
 
 UNSEEN = np.array((0.5, 0.5, 0.5))
-"""One-sigma speed (m/s, m/s, rad/s) of a robot that nobody watches: it may be pushed, or go on at walking pace."""
+"""One-sigma speed (m/s, m/s, rad/s) of a robot without data: it may be pushed, or continue at walking speed."""
 LARGEST_TURN = math.pi
-"""No heading is less certain than one that may be any."""
+"""Sigma of an unknown heading, rad."""
 STILL_M, STILL_RAD = 0.03, 0.02
-"""A robot has stood for as long as it is found no further than that from where it was: the noise of good matches."""
+"""Distance from the rest pose within which the robot is at rest (m, rad): the noise of good matches."""
 STARTS_S = 0.2
-"""So long a robot that stands is taken to be starting, as one that drives may: a scan that finds it on its way, or the
-one after a scan that was lost, must not come as a surprise."""
+"""Time (s) for which a robot at rest is modelled as starting, like a moving one.
+
+A scan of a robot that starts, or the first after a lost scan, must not exceed the covariance.
+"""
 
 DYING = 0.8
-"""Of a velocity that nothing confirms so much is left after each scan."""
+"""Factor on an unconfirmed velocity after each scan."""
 
 GYRO_RAD = 5e-4
-"""Error of a gyro reading's turn: rate noise and bias of a consumer MEMS gyro over some 10 ms."""
+"""Error (rad) of a gyro increment: rate noise and bias of a consumer MEMS gyro over some 10 ms."""
 BIAS_LEARNING = 0.02
-"""Share of the difference to a match's turn that goes into the gyro's bias, per 0.1 s."""
+"""Share of the difference to a match's rotation that updates the gyro bias, per 0.1 s."""
 GYRO_GATE = 5.0
-"""Deviations beyond which a gyro is not believed: wrong units, or damaged. No robot gains speed like that."""
+"""Gate on a gyro rate, in sigma: beyond it units are wrong, or the gyro is damaged. No robot accelerates like that."""
 
 DOUBT_LEARNING, SURPRISE_CAP, DOUBT_CAP = 0.03, 10.0, 100.0
 DOUBT_LEAST = 1.0
-"""Wheels that have been good for long may slip at any moment: they are never believed more than is stated."""
+"""Smallest noise factor: odometry that has long been good may slip at any time, so the stated noise is the minimum."""
 LEAST_EXPECTED = 0.3
-"""A match that should correct the prediction by less than a tenth of what it could says little about it."""
+"""Smallest expected squared correction; a match with less than a tenth of the possible one is hardly informative."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +56,12 @@ class MotionNoise:
     """One-sigma errors of a motion.
 
     Attributes:
-        slip: of a travelled metre, m. skid: m of sideways error per radian turned. turn: rad per radian turned.
+        slip: error per metre travelled, m.
+        skid: sideways error per radian turned, m.
+        turn: rad per radian turned.
         drift: rad per metre travelled.
         floor_m, floor_rad: random walk of odometry over 0.2 s (encoder steps, stamp jitter).
-        acceleration, angular_acceleration: what constant velocity does not know, m/s^2 and rad/s^2.
+        acceleration, angular_acceleration: unknown acceleration at constant velocity, m/s^2 and rad/s^2.
     """
 
     slip: float = 0.08
@@ -76,7 +80,7 @@ class MotionNoise:
 
 @dataclass(slots=True)
 class Gyro:
-    """What the gyro has added up: since the last odometry, and since the last match; and its bias, learned there."""
+    """Sums of gyro rotation (rad) and time (s) since the last odometry and the last match, and the learned bias."""
 
     turned_rad: float = 0.0
     span_s: float = 0.0
@@ -85,14 +89,14 @@ class Gyro:
     bias_rad_s: float = 0.0
 
     def add(self, turn: float, dt: float) -> None:
-        """Take in a reading, less the bias."""
+        """Add a reading, bias already subtracted."""
         self.turned_rad += turn
         self.span_s += dt
         self.match_turned_rad += turn
         self.match_span_s += dt
 
     def learn(self, turned_rad: float, dt: float) -> None:
-        """Compare with the turn that two matches ``dt`` apart have shown, if readings covered it."""
+        """Learn the bias from the rotation between two matches ``dt`` apart, if readings covered that interval."""
         span, said = self.match_span_s, self.match_turned_rad
         self.match_turned_rad = self.match_span_s = 0.0
         if dt > 0.0 and abs(span - dt) < 0.3 * dt:
@@ -101,17 +105,23 @@ class Gyro:
 
 @dataclass(slots=True, eq=False)
 class Motion:
-    """The moving pose and its uncertainty: the predicted half of a filter.
+    """The moving pose and its covariance: the predicted half of a filter.
 
     Attributes:
-        t_mono: instant the pose is true for. T_odom_base: the pose.
+        t_mono: instant of the pose.
+        T_odom_base: the pose.
         P: 3x3 covariance of the pose relative to the local map (odom-aligned axes).
         velocity, velocity_variance: (v_x, v_y, yaw rate) in the base frame.
-        t_felt: instant up to which the velocity's variance has grown. t_gyro: the same of what a gyro told.
-        t_told: when a match or wheels last told the pose; since then the velocity has carried it.
-        T_stood: where it stands, or last stood; t_stood: since when, infinite before anything is known.
-        ahead: motion already applied beyond the last odometry. odometry: whether any has arrived; t_odometry: its end.
-        doubt: factor on the noise's variance, learned. gyro: sums and bias. trail: the way of the last two seconds.
+        t_felt: instant up to which the velocity's variance has grown.
+        t_gyro: end of the latest accepted gyro reading.
+        t_told: instant of the latest match or odometry; since then the velocity extrapolates the pose.
+        T_stood, t_stood: present or latest rest pose, and the instant it began; infinite without data.
+        ahead: extrapolation beyond the last odometry.
+        odometry: whether any odometry has arrived.
+        t_odometry: its end.
+        doubt: learned factor on the noise's variance.
+        gyro: sums and bias.
+        trail: the motion of the last two seconds.
     """
 
     t_mono: float = -math.inf
@@ -134,23 +144,22 @@ class Motion:
 
 def move(motion: Motion, delta: Array, variance: Array) -> None:
     """Move the pose by ``delta`` in the base frame, with noise of ``variance`` (x, y, yaw; base-aligned)."""
-    T, P = np.empty(3), np.empty((3, 3))  # others may hold on to the pose before
+    T, P = np.empty(3), np.empty((3, 3))  # others may hold a reference to the previous pose
     carry_on(motion.T_odom_base, delta, variance, motion.P, T, P)
     motion.T_odom_base, motion.P = T, P
 
 
 def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
-    """Replace what was carried ahead by what the wheels say, and their turn by the gyro's where it covers the stretch.
+    """Replace the extrapolation by odometry, and its rotation by the gyro's where that covers the interval.
 
-    An increment that is no number is passed over.
-    Only an increment that follows on the last one speaks of the same stretch as the carry. One that begins anew (a
-    sender switched on late) or bridges a silence adds what lies after the present instant: until then the pose has been
-    held by others.
+    A non-finite increment is ignored.
+    Only an increment that continues the last one covers the interval of the extrapolation. One after a gap, or from a
+    sender switched on late, adds only its part after the present instant. Until then other data has kept the pose.
     """
     if not all(map(math.isfinite, record.delta.tolist())):
         return
     dt = record.t_end - record.t_begin
-    delta = np.array(record.delta, dtype=np.float64)  # a kernel takes no view of something else
+    delta = np.array(record.delta, dtype=np.float64)  # a kernel takes no view of another array
     variance = odometry_variance(delta, dt, noise)
     if dt > 0.0 and abs(motion.gyro.span_s - dt) < 0.3 * dt:
         delta = np.array((delta[0], delta[1], motion.gyro.turned_rad * dt / motion.gyro.span_s))
@@ -171,7 +180,7 @@ def on_odometry(motion: Motion, record: Odometry, noise: MotionNoise) -> None:
 
 
 def odometry_variance(delta: Array, dt: float, noise: MotionNoise) -> Array:
-    """Variance (x, y, yaw) of an odometry increment over ``dt``."""
+    """Variance (x, y, yaw; m^2, m^2, rad^2) of an odometry increment over ``dt`` seconds."""
     x, y, yaw = delta.tolist()
     way, turned, share = math.hypot(x, y), abs(yaw), min(1.0, max(dt, 0.02) / 0.2)
     along = noise.slip * way + noise.skid * turned
@@ -181,9 +190,9 @@ def odometry_variance(delta: Array, dt: float, noise: MotionNoise) -> Array:
 
 
 def feel(motion: Motion, delta: Array, interval: tuple[float, float], variance: Array, noise: MotionNoise) -> None:
-    """Update the velocity by a motion ``delta`` made over an interval: a scalar Kalman filter for each component.
+    """Update the velocity by a motion ``delta`` over an interval: a scalar Kalman filter for each component.
 
-    A mean over the interval is taken for its end, which adds half the interval's worth of unknown acceleration.
+    A mean over the interval serves as the value at its end. That adds unknown acceleration over half the interval.
     """
     begin, end = interval
     motion.t_told = max(motion.t_told, end)
@@ -198,10 +207,10 @@ def feel(motion: Motion, delta: Array, interval: tuple[float, float], variance: 
 
 
 def on_imu(motion: Motion, record: Imu, noise: MotionNoise) -> None:
-    """Turn by what the gyro says over its interval, less its bias, and move on at the velocity.
+    """Rotate by the gyro increment over its interval, without the bias, and extrapolate at the velocity.
 
-    A rate that the turn rate known so far cannot have become meanwhile is passed over: taken for certain, it would
-    carry the pose to where no scan fits, and the map would be begun anew there.
+    A rate that the robot cannot have reached since the last known rate is ignored. With the gyro's small variance it
+    would move the pose to where no scan fits. The local map would then restart.
     """
     dt = record.t_end - record.t_begin
     if not (0.0 < dt < LONGEST_CARRY_S and math.isfinite(record.dyaw)):
@@ -220,9 +229,9 @@ def on_imu(motion: Motion, record: Imu, noise: MotionNoise) -> None:
 
 
 def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
-    """Bring the pose to ``t_mono`` at constant velocity; an instant in the past changes nothing.
+    """Predict the pose to ``t_mono`` at constant velocity; an instant in the past changes nothing.
 
-    :data:`LONGEST_CARRY_S` after the last that told it, the pose is held, whether others are heard meanwhile or not.
+    After :data:`LONGEST_CARRY_S` without match or odometry, the pose stays constant, whatever other records arrive.
     """
     dt = t_mono - motion.t_mono
     if not dt > 0.0:
@@ -241,21 +250,21 @@ def carry_to(motion: Motion, t_mono: float, noise: MotionNoise) -> None:
 
 
 def stir(motion: Motion, t_mono: float) -> None:
-    """Note whether the pose is still where the robot has stood; else it has moved, and stands here at best."""
+    """Update the rest pose: a robot away from it has moved, and can be at rest here at best."""
     x, y, yaw = se2.between(motion.T_stood, motion.T_odom_base).tolist()
     if not (motion.t_stood <= t_mono and math.hypot(x, y) < STILL_M and abs(yaw) < STILL_RAD):
         motion.T_stood, motion.t_stood = motion.T_odom_base.copy(), t_mono
 
 
 def slow_down(motion: Motion) -> None:
-    """A velocity that nothing confirms is let die; what is taken from its square, it may be wrong by."""
+    """Reduce an unconfirmed velocity; the reduction of its square is added to its variance."""
     square = motion.velocity * motion.velocity
     motion.velocity = DYING * motion.velocity
     motion.velocity_variance = motion.velocity_variance + (1.0 - DYING * DYING) * square
 
 
 def untold(motion: Motion) -> tuple[float, float, float]:
-    """For how long nothing has told where the robot is (x, y) and looks (yaw), s; 0 before anything ever has."""
+    """Time (s) without a measurement of the position (x, y) and of the heading; 0 before the first one."""
     place = motion.t_mono - motion.t_told
     heading = motion.t_mono - max(motion.t_told, motion.t_gyro)
     place, heading = (max(0.0, t) if math.isfinite(t) else 0.0 for t in (place, heading))
@@ -263,11 +272,11 @@ def untold(motion: Motion) -> tuple[float, float, float]:
 
 
 def carried_variance(motion: Motion, before: tuple[float, float, float], dt: float, noise: MotionNoise) -> Array:
-    """Variance (x, y, yaw) that carrying the pose on for ``dt`` seconds adds, ``before`` so long carried already.
+    """Variance (x, y, yaw) added by an extrapolation of ``dt`` seconds, after extrapolation for ``before`` already.
 
-    What the velocity is wrong by stays the same from one carry to the next, so that errors add up, and not variances:
-    a robot that hears of its lamps between two scans knows no better how it moves than one that does not. Only a gyro
-    says anew how it turns. So this is what has added up by the end, less what had by the begin, however time is cut.
+    The velocity error stays the same from one extrapolation to the next, so errors add up, not variances. Light epochs
+    between two scans give no new information about the motion. Only a gyro measures the rotation again. The result is
+    the accumulated value at the end minus that at the begin, independent of how time is divided.
     """
     stood = max(0.0, motion.t_told - motion.t_stood)
     spread, unknown = (
@@ -285,13 +294,13 @@ def carried_variance(motion: Motion, before: tuple[float, float, float], dt: flo
 
 
 def carried_square(t: float, acceleration: float, axis: int, stood: float, doubt: float) -> float:
-    """Variance of how far a robot is along an axis from where its velocity of ``t`` seconds ago has brought it.
+    """Variance of the displacement along an axis from the extrapolation by a velocity ``t`` seconds old.
 
-    The velocity is another one by the acceleration that nobody knows, but by no more than that of a robot which nobody
-    watches; after :data:`LONGEST_CARRY_S` the pose is held, and all of such a velocity is its error. One that has
-    ``stood`` for so many seconds goes on standing for another ``t`` with the chance ``stood / (stood + t)``: nothing
-    says how long a halt lasts but how long it has lasted. If it starts, any moment is as likely, which makes the square
-    of its way a third.
+    The velocity changes by the unknown acceleration, limited by the speed of a robot without data. After
+    :data:`LONGEST_CARRY_S` the pose stays constant, and the whole velocity is its error. A robot at rest for ``stood``
+    seconds stays at rest for another ``t`` with probability ``stood / (stood + t)``. Only its past duration predicts
+    the length of a rest. If the robot starts, every instant is equally likely, which makes the square of its path a
+    third.
     """
     speed = float(UNSEEN[axis])
 
@@ -306,14 +315,14 @@ def carried_square(t: float, acceleration: float, axis: int, stood: float, doubt
 
 
 def learn(motion: Motion, correction: Array, H: Array, known: bool) -> Array:
-    """Learn from a match how far the prediction can be trusted; returns the covariance (3, 3) that this one's lacked.
+    """Learn the noise factor from a match; returns the covariance (3, 3) that this prediction lacked.
 
-    Noise figures are those of a good robot. Where wheels slip or stamps jitter, matches keep correcting the prediction
-    by more than its deviation says, and ``doubt`` scales the noise of the predictions to come. Of a prediction's own
-    variance, a match with the information ``H`` (3, 3) corrects the part ``(L + H)^-1 H``; the square that it should
-    have is that much. A correction beyond three deviations makes them a third of itself, along itself alone: across it
-    nothing was wrong, and an axis that no match holds would be blown up by every surprise along the other one, without
-    end.
+    The noise figures describe a good robot. Where wheels slip or stamps jitter, corrections exceed the prediction's
+    sigma, and ``doubt`` scales the noise of later predictions. A match with information ``H`` (3, 3) corrects the share
+    ``(L + H)^-1 H`` of the prediction's variance. That is the expected square of the correction. For a correction
+    beyond three sigma, the returned covariance reduces it to three sigma along its own direction only. Across it
+    nothing was wrong. Otherwise each large correction would enlarge the covariance of a degenerate direction without
+    limit.
     """
     L = invert3(motion.P)
     square = float(correction @ L @ correction)
@@ -325,10 +334,9 @@ def learn(motion: Motion, correction: Array, H: Array, known: bool) -> Array:
 
 
 FASTEST = (1.0, 2.0)
-"""m/s, rad/s. No robot indoors drives so much faster than its wheels, or its velocity, state; but wheels slip in turns,
-and stamps come late."""
+"""Largest speed above that of odometry or velocity, m/s and rad/s; wheels slip in turns, and stamps come late."""
 MARGIN_M, MARGIN_RAD = 0.4, 0.2
-"""A pose may move by so much more than a robot drives: matches of one place differ by less."""
+"""Additional displacement allowed, m and rad: matches of one position differ by less."""
 
 
 def too_far(moved: Array, dt: float) -> bool:

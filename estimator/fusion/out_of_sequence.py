@@ -1,9 +1,9 @@
-"""A scan that comes late: the state is taken back to where the robot was when it was true, and carried on again.
+"""Out-of-sequence scan: moves the state back to the instant of a late scan and re-propagates it after the match.
 
-Of the pose's covariance ``P_now = F P_then F' + Q`` the part that the way since has added is taken out and put back, so
-it is neither counted twice nor forgotten. The covariance ``X`` of the survey alignment's error with the pose's has
-grown by the same ``Q``, less what light has corrected since (`estimator.fusion.map_odom_filter`). What a match corrects
-then, it corrects now.
+The pose's covariance is ``P_now = F P_then F' + Q``. The part that the motion since has added is subtracted and then
+added again, so it counts once. ``X`` is the covariance of the survey alignment's error with the pose's. It has grown by
+the same ``Q``, less the corrections by light since (`estimator.fusion.map_odom_filter`). A correction by the match then
+applies to the present.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from estimator.numerics.symmetric3 import swing
 
 
 def late(motion: Motion, scan: Scan) -> bool:
-    """Whether the pose has been carried on beyond the end of a scan by more than stamps are uneven."""
+    """Whether the pose is ahead of the end of a scan by more than the variation of stamps."""
     return LATE_S < motion.t_mono - scan.t_end < ANOTHER_CLOCK_S
 
 
 def too_old(motion: Motion, scan: Scan) -> bool:
-    """Whether a scan ended so long before the present pose that nobody knows any more where that was."""
+    """Whether a scan ended before the motion history begins."""
     return late(motion, scan) and motion.trail.since(scan.t_end) is None
 
 
 def go_back(pose: MapPose, motion: Motion, scan: Scan) -> Ahead:
-    """Bring the pose back to where it was when a late scan ended, one that is not too old."""
+    """Move the pose back to the end of a late scan within the history; returns the motion since."""
     alignment = pose.alignment
     way = motion.trail.since(scan.t_end)
     assert way is not None
@@ -61,7 +61,7 @@ def go_back(pose: MapPose, motion: Motion, scan: Scan) -> Ahead:
 def come_again(pose: MapPose, motion: Motion, ahead: Ahead) -> None:
     """Re-propagate the corrected pose to the present.
 
-    Odometry is newer than the match: the velocity by it is restored.
+    If there is odometry, it is newer than the match, and its velocity is restored.
     """
     alignment = pose.alignment
     then = motion.T_odom_base
@@ -78,16 +78,16 @@ def come_again(pose: MapPose, motion: Motion, ahead: Ahead) -> None:
 
 
 def shared(alignment: SurveyAlignment | None, motion: Motion, t_mono: float, Q: Array) -> Array:
-    """Covariance of the alignment's error with ``Q``, what the way since an instant has added to the pose's.
+    """Covariance of the alignment's error with ``Q``, which the motion since an instant has added to the pose's.
 
-    All of it, but for what light has mended on the way. Taken out whole where a robot had light and no scans for a
-    second, it left a pose of then that had to move the map against each of its own corrections.
+    It is all of ``Q`` except for the corrections by light on the way. All of it must not be subtracted after a second
+    of light without scans. Each correction of the past pose would then move the map in the opposite direction.
 
     Args:
-        alignment: with the survey's frame, if there is one.
+        alignment: with the survey frame, if there is one.
         motion: of the present pose.
         t_mono: the instant.
-        Q: 3x3, odom axes, about the place of now.
+        Q: 3x3, odom axes, about the present position.
     """
     both, rest = np.zeros((3, 3)), Q
     for t_light, keep in () if alignment is None else alignment.mended:
@@ -102,7 +102,7 @@ def shared(alignment: SurveyAlignment | None, motion: Motion, t_mono: float, Q: 
 
 
 def swung(x: float, y: float, P: Array) -> Array:
-    """A covariance carried along a lever arm, see `estimator.numerics.symmetric3.swing`."""
+    """A covariance transformed along a lever arm, see `estimator.numerics.symmetric3.swing`."""
     P = np.array(P)
     swing(x, y, P)
     return P

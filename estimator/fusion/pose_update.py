@@ -1,4 +1,4 @@
-"""Fusing a match into the moving pose, and what the filters learn from it."""
+"""Scan-match update of the pose in the odom frame (Eq. 14-15), and learning of the range noise from residuals."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ from estimator.scan_matching.residual_correlation import agreement, beams_each
 LEAST_NOISE_M = 0.004
 LEARNING = 0.02
 HELD, HELD_YAW = 100.0, 830.0
-"""Information with which a match holds a direction, or the heading: 10 cm, 2 deg (`MatchResult.known_axes`)."""
+"""Smallest information of a known direction, and of the heading: 10 cm, 2 deg (`MatchResult.known_axes`)."""
 BLIND = (Reason.TOO_FEW_POINTS, Reason.MALFORMED, Reason.LATE, Reason.PASSED_OVER)
-"""Outcomes of a scan that has shown nothing: they do not speak against the map."""
+"""Results of a scan without usable data: they do not contradict the map."""
 CAUCHY = 0.807
-"""What the robust weights of the matcher leave of a Gaussian's variance."""
+"""Share of a Gaussian's variance that remains under the robust weights of the matcher."""
 
 
 def fuse(pose: MapPose, motion: Motion, matching: MatchMemory, match: MatchResult, noise: MotionNoise) -> Array | None:
-    """Take the matched pose and add its information; without odometry it also gives the velocity.
+    """Set the matched pose and add its information; without odometry the match also gives the velocity.
 
-    The match has weighed the prediction in already (Eq. 14), so its pose is the fused pose.
+    The match has included the prediction already (Eq. 14), so its pose is the fused pose.
 
     Returns:
-        Covariance (3, 3; odom axes) that the way to here has gained because nothing held the pose, None for none.
+        Covariance (3, 3; odom axes) that the path to here gains from prediction along a degenerate direction, None for
+            none.
     """
     more: Array | None = None
     if match.ok:
@@ -53,7 +54,7 @@ def fuse(pose: MapPose, motion: Motion, matching: MatchMemory, match: MatchResul
             if more is not None:
                 pose.P_anchor += more
     elif match.reason is not Reason.NO_MAP:
-        matching.failures += match.reason not in BLIND  # a scan that shows nothing contradicts nothing
+        matching.failures += match.reason not in BLIND  # a scan without usable data does not contradict the map
         if not motion.odometry:
             motion_model.slow_down(motion)
     matching.t_scan, matching.T_odom_scan = motion.t_mono, motion.T_odom_base
@@ -63,9 +64,9 @@ def fuse(pose: MapPose, motion: Motion, matching: MatchMemory, match: MatchResul
 def updated(P: Array, H: Array, odometry: bool) -> Array:
     """Covariance (3, 3) of a prediction ``P`` after a match with information ``H``.
 
-    A direction that the match does not hold gets no surer by it. In a corridor what it does hold is not the same to a
-    hair from scan to scan; a tenth of a degree between two of them, forty times a second, would add up to centimetres
-    along an axis of which none has seen anything. Without ``odometry`` there is nothing else: see :func:`unheld`.
+    A degenerate direction of the match gains no information. In a corridor the known direction varies slightly from
+    scan to scan. A tenth of a degree, forty times a second, would add up to centimetres of false knowledge along the
+    corridor. Without ``odometry`` there is no other source: see :func:`unheld`.
     """
     after = np.empty((3, 3))
     informed(P, H, after)
@@ -79,7 +80,7 @@ def updated(P: Array, H: Array, odometry: bool) -> Array:
 
 
 def loose_direction(H: Array) -> Array | None:
-    """Unit vector (x, y) along which information ``H`` (3, 3) does not hold the place, None where it holds all."""
+    """Unit vector (x, y) along which information ``H`` (3, 3) leaves the position unknown, None if there is none."""
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = H.tolist()
     tt = max(tt, 1e-9)
     xx, xy, yy = xx - xt * xt / tt, xy - xt * yt / tt, yy - yt * yt / tt
@@ -89,12 +90,12 @@ def loose_direction(H: Array) -> Array | None:
 
 
 def unheld(matching: MatchMemory, motion: Motion, H: Array, dt: float) -> Array | None:
-    """Covariance (3, 3; odom axes) that the place in the map gains along a direction that no match holds; None: none.
+    """Covariance (3, 3; odom axes) that the position in the map gains along a degenerate direction; None: none.
 
-    Without wheels the pose is a guess along such a direction: the velocity carries it on, and no match contradicts it.
-    What it may be wrong by adds up with the way. The map that is laid meanwhile is out of place for good, so it is the
-    covariance of the place in the map that grows: at walking pace, from half a second on. A silence of the laser has
-    grown the prediction's own covariance already.
+    Without odometry the constant velocity alone predicts the pose along such a direction, and no match can correct it.
+    Its error grows with the distance. The map created meanwhile keeps that error for good, so the covariance of the
+    position in the map grows. It grows at walking speed, from half a second on. A gap in the lidar data has already
+    enlarged the prediction's own covariance.
     """
     loose = loose_direction(H)
     if motion.odometry or loose is None:
@@ -109,13 +110,13 @@ def unheld(matching: MatchMemory, motion: Motion, H: Array, dt: float) -> Array 
 
 
 def noise_of(matching: MatchMemory, scan: Scan) -> float:
-    """Range noise to reckon with, m: as residuals show, within a factor of three of the device's own figure."""
+    """Assumed range noise, m: as learned from residuals, within a factor of three of the device's own figure."""
     stated = max(scan.sigma_m, LEAST_NOISE_M)
     return min(max(matching.noise_m or stated, stated / 3.0, LEAST_NOISE_M), 3.0 * stated)
 
 
 def learn_noise(matching: MatchMemory, match: MatchResult) -> None:
-    """Follow the variance of the residuals."""
+    """Update the exponentially weighted variance of the residuals."""
     square = match.residual_m**2 / CAUCHY
     if matching.noise_m > 0.0:
         square = (1.0 - LEARNING) * matching.noise_m**2 + LEARNING * square
@@ -123,12 +124,12 @@ def learn_noise(matching: MatchMemory, match: MatchResult) -> None:
 
 
 def beams_per_sample(matching: MatchMemory) -> float:
-    """How many beams count as one independent measurement, by what residuals have shown."""
+    """Beams per independent measurement, from the correlation of residuals."""
     return beams_each(*matching.residual_sums.tolist())
 
 
 def learn_correlation(matching: MatchMemory, points: Array, T_odom_base: Array) -> None:
-    """Follow how neighbouring residuals agree, from a scan that has just been matched: ``points`` (n, 4)."""
+    """Update the correlation of neighbouring residuals from a scan that has just been matched: ``points`` (n, 4)."""
     local = matching.local_map
     if local is not None:
         gate = 3.0 * max(matching.noise_m, LEAST_NOISE_M)

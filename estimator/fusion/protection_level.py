@@ -1,19 +1,20 @@
-"""How wrong the pose may be: a protection level, as aviation calls it, at the risk :data:`RISK` a pose.
+"""Protection level of the pose: upper limit of its error at the integrity risk :data:`RISK`, by solution separation.
 
-If the place itself is not in doubt (who publishes the level knows that), the error of ``T_map_base`` is above it with
-no more than that probability. It is the largest of what three hypotheses allow (multiple hypothesis solution
+If the pose is the right hypothesis, the error of ``T_map_base`` exceeds the level with no more than that probability.
+The publisher checks that condition. The level is the largest under three fault hypotheses (multiple hypothesis solution
 separation, Blanch et al., NAVIGATION 2010; docs/integrity.md has the derivation):
 
-* nothing is wrong: quantiles of the covariance, raised by what errors that hang together make of it;
-* light is wrong since lately (a lamp moved, exchanged, reflected): how far the pose has since left the one that the
-  laser alone would have, plus what that one may be wrong by;
-* the laser is wrong (it slipped, the room looks alike): how far the pose is from the one that light alone has, plus
-  what that one may be wrong by.
+* No fault: quantiles of the covariance, enlarged for correlated errors.
+* Light has been wrong recently (a lamp moved, exchanged, reflected): the separation of the pose from the lidar
+  solution, plus the error of that solution.
+* The lidar is wrong (it slipped, or the room looks alike): the separation of the pose from the light solution, plus the
+  error of that solution.
 
-Where there is one witness only nothing can be separated, and the first bound is widened instead. Laser and light share
-the wheels; a slip of theirs moves both predictions, and each witness corrects it by itself. Without wheels they share
-the laser's way (`guide`): a laser that slides leads light along until lamps have corrected it, for which the level
-believes its position less (`light_inflation.UNGUIDED`); and of the heading the laser is the only witness.
+With one sensor only there is no separation, and the first limit is enlarged instead. Lidar and light share the
+odometry. Its slip moves both predictions, and each sensor corrects it by itself. Without odometry they share the
+lidar's motion (`guide`). A lidar match that slides moves the light solution along until lamps have corrected it. The
+level then uses a larger covariance of the light position (`light_inflation.UNGUIDED`). The heading then comes from the
+lidar alone.
 """
 
 from __future__ import annotations
@@ -36,32 +37,32 @@ if TYPE_CHECKING:  # compiles and costs nothing where there is no photodiode
     from estimator.light_filter.light_channel import LightChannel
 
 RISK: Final = 1e-4
-"""Probability with which an error may be above its bound, a pose."""
+"""Integrity risk: probability per pose that the error exceeds the protection level."""
 FAULTY: Final = 1e-3
-"""Probability that a witness is wrong without contradicting the other, a pose."""
+"""Probability per pose that one sensor is wrong and agrees with the other."""
 ALIKE: Final = 1.5
-"""By how many deviations more errors are off that hang together: bending of the map, walls that reflect light."""
+"""Enlargement of sigma for correlated errors: deformation of the map, walls that reflect light."""
 ALONE: Final = 1.5
-"""By how much a bound is wider that one witness gives which nobody watches."""
+"""Enlargement of a limit that one sensor gives without another to check it."""
 UNKNOWN_M = 0.03
 UNKNOWN_RAD = 0.01
-"""What no filter knows of: stamps, lever arms, the survey itself."""
+"""Errors outside every filter's model (m, rad): stamps, lever arms, the survey itself."""
 STRAIN_M, STRAIN_RAD = 0.02, 0.004
-"""Drift of a pose that the laser alone carries on, by the root of a metre: three times what tours have shown."""
+"""Drift of a pose by the lidar alone, per root of a metre (m, rad): three times the drift measured on tours."""
 STRAIN: Final = np.diag((STRAIN_M**2, STRAIN_M**2, STRAIN_RAD**2))
 MOST_M: Final = 30.0
-"""A bound above this says nothing."""
+"""Largest useful protection level, m; above it the level is unavailable."""
 
 K_PLAIN: Final = ALIKE * math.sqrt(-2.0 * math.log(0.5 * RISK))
-"""Quantile of a distance in the plane (Rayleigh), and more than Gauss's of a heading, without a fault."""
+"""Fault-free quantile of a distance in the plane (Rayleigh); it exceeds the Gaussian quantile of a heading."""
 K_FAULT: Final = ALIKE * math.sqrt(-2.0 * math.log(0.25 * RISK / FAULTY))
-"""The same with one of two witnesses wrong, each of which may take a quarter of the risk."""
+"""The same with one of two sensors wrong; each may use a quarter of the risk."""
 
 
 def bound(
     pose: MapPose, motion: Motion, light: LightChannel | None, matching: MatchMemory, P: Array
 ) -> Protection | None:
-    """Bound on the error of the pose after this step, ``P`` being its covariance; None: there is none."""
+    """Protection level of the pose after this step, with its covariance ``P``; None if it is unavailable."""
     alignment = pose.alignment
     laser = matching.local_map is not None and (motion.t_mono - matching.t_match < 1.0)
     lit = alignment is not None and alignment.placed and light is not None and light.result.fix is Fix.GOOD
@@ -79,12 +80,12 @@ def bound(
 
 
 def on_wheels(light: LightChannel | None) -> bool:
-    """Whether wheels move the light filter."""
+    """Whether odometry drives the light filter."""
     return light is not None and light.on_wheels
 
 
 def _snapshot(pose: MapPose, steps: float, P: Array) -> None:
-    """Keep T_map_odom for light to be compared with, as long as the laser carries the pose on from it."""
+    """Keep T_map_odom for the lidar solution, as long as the lidar tracks the pose without a break."""
     alignment = pose.alignment
     if alignment is None:
         return
@@ -95,7 +96,7 @@ def _snapshot(pose: MapPose, steps: float, P: Array) -> None:
 
 
 def _without_light(pose: MapPose, motion: Motion, steps: float) -> tuple[float, float]:
-    """The solution of the laser alone, without light since the oldest snapshot: separation and spread (m, rad)."""
+    """Lidar solution, without light since the oldest snapshot: separation plus its error (m, rad)."""
     if not pose.history.kept:
         return 0.0, 0.0
     T_map_odom, P, begun = pose.history.kept[0]
@@ -106,7 +107,7 @@ def _without_light(pose: MapPose, motion: Motion, steps: float) -> tuple[float, 
 
 
 def _without_laser(pose: MapPose, motion: Motion, light: LightChannel) -> tuple[float, float]:
-    """What light alone says: separation and spread. Without wheels it says nothing of the heading."""
+    """Light solution: separation plus its error (m, rad). Without odometry it gives no heading."""
     alignment = pose.alignment
     assert alignment is not None
     wheels = light.on_wheels
@@ -121,7 +122,7 @@ def _without_laser(pose: MapPose, motion: Motion, light: LightChannel) -> tuple[
 
 
 def spread(P: Array, k: float) -> tuple[float, float]:
-    """``k`` deviations of a covariance (3, 3): of the larger axis in the plane, and of the heading."""
+    """``k`` sigmas of a covariance (3, 3): of the larger axis in the plane (m), and of the heading (rad)."""
     (xx, xy, _), (_, yy, _), (_, _, tt) = P.tolist()
     mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
     return k * math.sqrt(max(0.0, mean + half)), k * math.sqrt(max(0.0, tt))

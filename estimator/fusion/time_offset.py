@@ -1,13 +1,13 @@
-"""How much later the laser's stamps are than the wheels', from the robot's turning as both have seen it.
+"""Time offset between scan stamps and odometry stamps, from the rotation that both measure.
 
-A line that delays every scan alike cannot be heard in the scans' own stamps. But a robot begins to turn, and ends it,
-at one instant: if the yaw that matches have shown from scan to scan is what the wheels counted some time earlier, the
-scans are stamped late by that much, or the wheels early. The increments ``m`` of matches are held against those ``w``
-of the wheels at each of :data:`LAGS`. The wheels' scale ``a`` is free, and ``R = sum (m - a w)^2`` is least at the lag.
-While the robot stands, drives straight or turns evenly, all lags say the same, and nothing is added.
+A constant delay of all scans is not visible in their own stamps. But a robot begins and ends a rotation at one instant.
+If the yaw of matches follows that of odometry with a delay, scans are stamped that late, or odometry early. The yaw
+increments ``m`` of matches are compared with those ``w`` of odometry at each of :data:`LAGS`. The odometry scale ``a``
+is free, and ``R = sum (m - a w)^2`` is smallest at the offset. At rest, straight ahead and at a constant turn rate all
+offsets are equal, and nothing is added.
 
-Wheels that slip when a turn begins look early, too. So what a lag leaves over must be next to nothing, and any one
-stretch of the evidence may be left out: it takes the begin of a turn and the end of one, or more of them.
+Wheels that slip at the begin of a turn look early, too. So the remaining sum must be small. The result must also not
+depend on any one segment of the data. It needs the begin and the end of a turn, or several.
 """
 
 from __future__ import annotations
@@ -25,57 +25,66 @@ from estimator.result import Lag, MatchResult, Reason
 
 STEP_S: Final = 0.05
 LAGS: Final = STEP_S * np.arange(-8, 13)
-"""Lags that are tried, s: wheels late by 0.4 s, laser late by 0.6 s; the first and the last are no answers."""
+"""Offsets tried, s: odometry late by 0.4 s to lidar late by 0.6 s; the first and the last are never results."""
 NONE: Final = 8
-"""Index of no lag."""
+"""Index of offset 0."""
 
 APART_S: Final = 0.08
-"""Matches nearer together are left out: the turn between them is less above their noise."""
+"""Shortest time between two matches in use, s: over less time the rotation is not above their noise."""
 LONGEST_S, SILENT_S = 0.5, 2.0
-"""Longest time between two matches, or two readings of the wheels; a silence after which all may be otherwise."""
+"""Longest time between two matches, or two odometry readings, s; a gap after which the offset may have changed, s."""
 STRETCH_S: Final = 0.02
-"""Readings are put together up to this length; they may come a thousand times a second."""
+"""Readings are merged up to this length, s; they may come a thousand times a second."""
 DEPTH: Final = 256
-"""Points of the wheels' way that are kept: 2.5 s and more."""
+"""Points of the odometry path that are kept: 2.5 s and more."""
 HELD_YAW: Final = 1e4
-"""Information of a match's yaw from which on it is one: 0.6 deg."""
+"""Smallest information of a match's yaw: 0.6 deg."""
 TELLING_RAD: Final = 0.02
-"""By how much an increment of the wheels has to differ from lag to lag to say something about it."""
+"""Smallest range of an odometry increment over the offsets, rad; below it the increment is not informative."""
 BLOCK, BLOCKS = 4, 10
-"""Increments that say something are added up in blocks of so many; the latest so many blocks are remembered."""
+"""Informative increments per block, and number of blocks kept."""
 
 NOISE_RAD: Final = 0.003
-"""One sigma of an increment at its best: two matches, encoder steps."""
+"""Smallest sigma of an increment, rad: two matches, encoder steps."""
 LEFT, STILL_LEFT = 0.1, 0.3
-"""Share of what is left over without a lag that may be with it; the greater one where it has been told already, and
-where two blocks are left out."""
+"""Largest share of the offset-free sum that may remain; the larger value applies to a reported offset.
+
+The larger value also applies with two blocks omitted.
+"""
 REFUTED, STILL_REFUTED, OTHERS = 50.0, 16.0, 9.0
-"""By how many variances of an increment none, and each lag of the other sign, has to be worse: seven sigma; four where
-two blocks are left out; and any lag beyond :data:`NEAR` steps: evenly weaving looks alike after each period."""
+"""Required excess, in variances of an increment, of offset 0 and each offset of the other sign: seven sigma.
+
+Four sigma with two blocks omitted. OTHERS applies to any offset more than :data:`NEAR` steps away, because a regular
+weaving motion repeats after each period.
+"""
 NEAR: Final = 3
 SCALE: Final = (0.5, 2.0)
-"""Laser's turn by wheels' turn: beyond, they do not tell of the same."""
+"""Limits of the lidar's rotation over that of odometry; outside, they do not measure the same motion."""
 STAMPS_S: Final = 0.005
-"""One sigma of what stamps, and the time that a sweep takes, leave open."""
+"""One sigma of what stamps, and the duration of a scan, leave open."""
 LEAST_S, SIGMAS = 0.1, 3.0
-"""A lag that is told is greater than this by so many of its deviations; once told, half of it will do.
+"""Smallest reported offset, s, exceeded by so many of its sigmas; half of it suffices once it is reported.
 
-Stamps at the arrival of scans whose sweep nobody knows are late by 0.09 s, filters in motor controllers by 0.07 s: both
-in logs of robots that nothing was wrong with.
+Scans stamped at their arrival, with unknown duration, are late by 0.09 s; filters in motor controllers cause 0.07 s.
+Both occur in logs of robots without a fault.
 """
 
 
 @dataclass(slots=True, eq=False)
 class TimeOffset:
-    """What is remembered.
+    """State of the time offset estimator.
 
     Attributes:
-        told: the lag, None: none is beyond doubt.
-        times, turned: (2 DEPTH,) the wheels' way, s and rad. points: how many count.
-        waiting: scans that the wheels have not reached yet: end of the sweep, yaw (no number: not matched). newest: end
-            of the latest that matched.
-        before: the latest that they have reached, and their turn at its instant less each of :data:`LAGS`.
-        sums: (BLOCKS, 2, lags) of ``m w`` and ``w w``. own: (BLOCKS, 2) count, and sum of ``m m``. block: being filled.
+        told: the reported offset, None: none is certain.
+        times, turned: (2 DEPTH,) the odometry path, s and rad.
+        points: number of valid entries.
+        waiting: scans that odometry has not reached yet: end of the scan, yaw (NaN: not matched).
+        newest: end of the latest scan that matched.
+        before: the latest scan that odometry has reached, and the odometry yaw at its instant less each of
+            :data:`LAGS`.
+        sums: (BLOCKS, 2, lags) of ``m w`` and ``w w``.
+        own: (BLOCKS, 2) count, and sum of ``m m``.
+        block: index of the block being filled.
     """
 
     told: Lag | None = None
@@ -90,14 +99,14 @@ class TimeOffset:
     block: int = 0
 
     def forget(self) -> None:
-        """What was before says nothing of what comes; the wheels' way stays."""
+        """Clear the estimate and its sums, where the past does not predict the future; the odometry path stays."""
         self.told, self.before, self.newest, self.block = None, None, -math.inf, 0
         self.waiting.clear()
         self.sums[:] = self.own[:] = 0.0
 
 
 def on_odometry(lag: TimeOffset, record: Odometry) -> None:
-    """Follow the wheels. A reading that does not follow on the last one, and a laser's silence, end what was known."""
+    """Add an odometry reading. A gap in the readings, or in the matches, clears the estimate."""
     t_end, yaw, last = record.t_end, float(record.delta[2]), lag.points - 1
     follows = last >= 0 and abs(record.t_begin - lag.times[last]) < 1e-6 and 0.0 <= t_end - record.t_begin <= LONGEST_S
     if not (follows and math.isfinite(yaw)):
@@ -116,7 +125,7 @@ def on_odometry(lag: TimeOffset, record: Odometry) -> None:
 
 
 def on_match(lag: TimeOffset, scan: Scan, match: MatchResult) -> None:
-    """Take in a match. Stamps that have gone back, and wheels that are silent, end what was known."""
+    """Add a match. Stamps that go backwards, and odometry without data, clear the estimate."""
     if not lag.points:
         return
     if match.reason is Reason.LATE or scan.t_end - lag.times[lag.points - 1] > SILENT_S:
@@ -134,7 +143,7 @@ def on_match(lag: TimeOffset, scan: Scan, match: MatchResult) -> None:
 
 
 def compare(lag: TimeOffset, t_mono: float, yaw: float) -> None:
-    """Hold the turn that a match at an instant has shown since the one before against the wheels', at each lag."""
+    """Compare the yaw increment of two successive matches with that of odometry, at each offset."""
     if t_mono - LAGS[-1] < lag.times[0]:
         lag.before = None
         return
@@ -156,12 +165,12 @@ def compare(lag: TimeOffset, t_mono: float, yaw: float) -> None:
 
 
 def left_over(sums: Array, own: Array) -> Array:
-    """R at each lag, (..., lags), of sums (..., 2, lags) and (..., 2)."""
+    """R at each offset, (..., lags), of sums (..., 2, lags) and (..., 2)."""
     return np.asarray(own[..., 1:] - sums[..., 0, :] ** 2 / np.maximum(sums[..., 1, :], NOISE_RAD**2))
 
 
 def judged(lag: TimeOffset) -> Lag | None:
-    """The lag, where it is beyond doubt; one that has been told stays until there is some."""
+    """The offset, if it is certain; a reported one stays until it becomes uncertain."""
     sums, own = lag.sums.sum(0), lag.own.sum(0)
     R, count = left_over(sums, own), float(own[0])
     best = int(R.argmin())
@@ -187,9 +196,9 @@ def judged(lag: TimeOffset) -> Lag | None:
 
 
 def left_out(lag: TimeOffset) -> Array:
-    """R, (n, lags), with each two blocks in a row left out that hold something.
+    """R, (n, lags), with each two consecutive non-empty blocks omitted.
 
-    Slip is over within two blocks: it would have to come again, and in the same way, to speak for a lag in all rows.
+    Slip ends within two blocks. It would have to repeat in the same way to support an offset in every row.
     """
     sums, own = lag.sums + np.roll(lag.sums, 1, 0), lag.own + np.roll(lag.own, 1, 0)
     R = left_over(lag.sums.sum(0) - sums, lag.own.sum(0) - own)
@@ -197,13 +206,13 @@ def left_out(lag: TimeOffset) -> Array:
 
 
 def stands(R: Array, best: int, wrong: slice, variance: float) -> bool:
-    """Whether a lag, by its index, stands in each row; ``wrong``: lags that it denies."""
+    """Whether the offset of index ``best`` is supported in each row; ``wrong``: offsets that it excludes."""
     clear = R[:, wrong].min(1) - R[:, best] >= STILL_REFUTED * variance
     return bool((clear & (R[:, best] <= STILL_LEFT * R[:, NONE])).all())
 
 
 def scatter(R: Array, tau: float) -> float:
-    """Variance of the lag ``tau`` by how far the rows' lags lie from it (jackknife, two of n left out)."""
+    """Variance of the offset ``tau`` from the spread of the rows' offsets (jackknife, two of n omitted)."""
     rows, best = np.arange(len(R)), np.clip(R.argmin(1), 1, len(LAGS) - 2)
     before, here, after = R[rows, best - 1], R[rows, best], R[rows, best + 1]
     bend = np.maximum(before - 2.0 * here + after, NOISE_RAD**2)

@@ -1,4 +1,4 @@
-"""Constraints between submaps: relative poses by the way driven and by loops, with their information."""
+"""Edges of the pose graph between submaps: relative poses by odometry and by loop closures, with their information."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from estimator.numerics.arrays import Array, Bools, Ints
 from estimator.numerics.symmetric3 import invert3
 
 MANY: Final = 3
-"""Loops kept between the same two submaps."""
+"""Most loops kept between the same two submaps."""
 
 
 @dataclass(slots=True, eq=False)
 class Constraints:
-    """What joins the submaps; arrays with one row each.
+    """Edges between submaps; arrays with one row each.
 
     Attributes:
-        between: (m, 2) keys of two submaps a, b. T: (m, 3) T_a_b. information: (m, 6), upper triangle, in b's axes.
+        between: (m, 2) keys of two submaps a, b.
+        T: (m, 3) T_a_b.
+        information: (m, 6), upper triangle, in b's axes.
         loop: (m,) whether it is a loop, which may be false.
     """
 
@@ -31,10 +33,10 @@ class Constraints:
     loop: Bools = field(default_factory=lambda: np.empty(0, np.bool_))
 
     def add(self, a: int, b: int, T_a_b: Array, P: Array, is_loop: bool) -> None:
-        """Join two submaps; ``P`` is the covariance of T_a_b in b's axes.
+        """Add an edge between two submaps; ``P`` is the covariance of T_a_b in b's axes.
 
-        Of many loops of a pair the latest stay, and of many ways the surest one: what is kept is bounded by the submaps
-        that are, however often others are taken out between them.
+        Of many loops of a pair the latest stay, and of many odometry edges the most certain one. So the number of
+        submaps bounds the number of edges, however often submaps between them are removed.
         """
         same = np.flatnonzero((self.loop == is_loop) & (np.sort(self.between, axis=1) == sorted((a, b))).all(axis=1))
         if len(same) >= (MANY if is_loop else 1):
@@ -48,12 +50,12 @@ class Constraints:
         self.loop = np.append(self.loop, is_loop)
 
     def keep(self, which: Bools) -> None:
-        """Forget all others."""
+        """Remove all other edges."""
         self.between, self.T = self.between[which], self.T[which]
         self.information, self.loop = self.information[which], self.loop[which]
 
     def split(self, first: int) -> Constraints:
-        """Take out what joins submaps with keys below ``first``, and return it; what joins them with others goes."""
+        """Remove and return the edges between submaps with keys below ``first``; edges across that limit are lost."""
         a, b = (self.between < first).T
         which = a & b
         out = Constraints(self.between[which], self.T[which], self.information[which], self.loop[which])
@@ -61,24 +63,24 @@ class Constraints:
         return out
 
     def put(self, other: Constraints) -> None:
-        """Add all of the other ones."""
+        """Add all edges of another set."""
         self.between, self.T = np.vstack((other.between, self.between)), np.vstack((other.T, self.T))
         self.information = np.vstack((other.information, self.information))
         self.loop = np.append(other.loop, self.loop)
 
     def covariance(self, row: int) -> Array:
-        """Of a constraint's T, 3x3, in b's axes."""
+        """Covariance of an edge's T, 3x3, in b's axes."""
         H = np.empty((3, 3))
         for k, (i, j) in enumerate(UPPER):
             H[i, j] = H[j, i] = self.information[row, k]
         return invert3(H)
 
     def of(self, key: int) -> Ints:
-        """Rows that join this submap with others."""
+        """Rows of the edges of this submap."""
         return np.flatnonzero((self.between == key).any(axis=1))
 
     def seen_from(self, key: int, row: int) -> tuple[int, Array, Array]:
-        """The other submap of a constraint: its key, T_key_other, and the covariance of that in the other's axes."""
+        """The other submap of an edge: its key, T_key_other, and the covariance of that in the other's axes."""
         a, b = self.between[row].tolist()
         T, P = self.T[row], self.covariance(row)
         if a == key:
@@ -87,9 +89,9 @@ class Constraints:
         return a, se2.inverse(T), A @ P @ A.T
 
     def reroute(self, key: int, hub: int, T_hub_key: Array, P: Array, rows: Ints | None = None) -> None:
-        """Take a submap out: what else it is joined with is joined with ``hub`` by way of it; ``P`` in its axes.
+        """Remove a submap and connect its other neighbours with ``hub`` through it; ``P`` in its axes.
 
-        ``rows``: constraints that are handed on so, all if None.
+        ``rows``: edges that are passed on so, all if None.
         """
         rows = self.of(key) if rows is None else rows
         others = [(*self.seen_from(key, row), bool(self.loop[row])) for row in rows]

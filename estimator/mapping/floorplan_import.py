@@ -1,9 +1,9 @@
-"""A map of cells from elsewhere as submaps to be localised in: surfaces with their directions, and what is free.
+"""Import of an occupancy map as submaps for localisation: surfaces with their directions, and free space.
 
-Walls become line elements by fitting a line to the faces of occupied cells that look the same way, so that a place is
-told to a fraction of a cell. Free space is told as a robot would have seen it: from places all over the floor the cells
-are looked at by a scan of :data:`BEAMS` beams, and each square of :data:`PIECE_M` becomes a submap of what is seen from
-within it.
+Walls become line elements: a line is fitted to the faces of occupied cells with the same orientation. This gives a
+position to a fraction of a cell. Free space is what a robot would have seen: simulated scans of :data:`BEAMS` beams
+from positions all over the free area. Each square of :data:`PIECE_M` becomes a submap of what is visible from within
+it.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ Cells = npt.NDArray[np.int8]
 
 OCCUPIED, FREE, UNKNOWN = 1, 0, -1
 PIECE_M, EYE_M = 3.0, 1.5
-"""Squares that become a submap, and squares from whose middle the cells are looked at."""
+"""Side (m) of the squares that become a submap, and of the squares with one simulated scan each."""
 CLEAR_M: Final = 0.2
-"""Nothing may be so near to a place from which the cells are looked at."""
+"""Smallest clearance of a simulated scan's position, m."""
 BEAMS: Final = 720
 FAR_M: Final = 30.0
 REACH_M: Final = 0.2
-"""Faces this near, at least three cells, make a line."""
+"""Distance (m) of the faces in one line, at least three cells."""
 FEW: Final = 4
-"""Faces that a line needs; a surface of fewer than twice as many counts little until it has been seen."""
+"""Fewest faces of a line; a surface of fewer than twice as many has little weight until it is seen."""
 JOINT: Final = np.diag((0.005**2, 0.005**2, math.radians(0.05) ** 2))
-"""Covariance of neighbouring submaps: the map's cells do not bend."""
+"""Covariance of neighbouring submaps: the map's cells have no deformation."""
 SIDES: Final = ((0, 1), (0, -1), (1, 0), (-1, 0))
-"""Row and column steps towards the cell that a face looks at."""
+"""Row and column steps towards the free cell in front of a face."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,9 +50,11 @@ class Plan:
     """Cells and the surfaces fitted to them.
 
     Attributes:
-        cells: see `Cells`. resolution: m per cell. lines: (n, 5) x, y, normal x, y and variance of the direction, in
-            the frame of the cells. count: faces in each. line_of: (4, rows, columns) row of ``lines`` for each side of
-            each cell, -1 where there is none.
+        cells: see `Cells`.
+        resolution: m per cell.
+        lines: (n, 5) x, y, normal x, y and variance of the direction, in the frame of the cells.
+        count: number of faces in each.
+        line_of: (4, rows, columns) row of ``lines`` for each side of each cell, -1 where there is none.
     """
 
     cells: Cells
@@ -82,7 +84,7 @@ def plan_of(cells: Cells, resolution: float) -> Plan:
 def fitted(
     face: npt.NDArray[np.bool_], towards: Array, resolution: float
 ) -> tuple[Array, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Lines through the faces of one side around each of them, how many are in each, and the (row, column) of each."""
+    """Lines through the faces of one side around each of them, with their counts of faces and (row, column)."""
     at = np.argwhere(face)
     reach = max(3, round(REACH_M / resolution))
     padded = np.pad(face, reach)
@@ -108,7 +110,7 @@ def fitted(
 
 @kernel("void(i8[:, :, ::1], i8, i8, i8, u1[::1])", inner=True)
 def mark(line_of: npt.NDArray[np.int64], side: int, row: int, column: int, seen: npt.NDArray[np.uint8]) -> None:
-    """Mark the lines of a cell and of those beside it as seen: beams a few metres off pass between cells."""
+    """Mark the lines of a cell and of its neighbours as seen: beams a few metres away pass between cells."""
     _, rows, columns = line_of.shape
     for a in range(max(0, row - 1), min(rows, row + 2)):
         for b in range(max(0, column - 1), min(columns, column + 2)):
@@ -127,10 +129,10 @@ def look(
     scan: tuple[Array, Array, npt.NDArray[np.uint8]],
     seen: npt.NDArray[np.uint8],
 ) -> None:
-    """What a lidar at ``eye`` (x, y, resolution) sees of the cells: fills in ``scan``, and marks the lines it hits.
+    """Simulate a lidar scan of the cells from ``eye`` (x, y, resolution): fills in ``scan``, and marks the lines hit.
 
-    A beam ends on the line fitted to the side of the cell that it enters; where there is none, in the cell's middle.
-    ``surfaces``: ``line_of`` and ``lines`` of a `Plan`. ``seen``: for each of the lines.
+    A beam ends on the line fitted to the side of the cell that it enters. Where there is none, it ends at the centre of
+    the cell. ``surfaces``: ``line_of`` and ``lines`` of a `Plan`. ``seen``: one entry per line.
     """
     line_of, lines = surfaces
     bearing, distance, kind = scan
@@ -173,7 +175,7 @@ def look(
 
 
 def eyes_of(plan: Plan) -> dict[tuple[int, int], list[Array]]:
-    """Places to look from, (x, y) in the frame of the cells, by the square of :data:`PIECE_M` that they lie in."""
+    """Positions of the simulated scans, (x, y) in the frame of the cells, by their square of :data:`PIECE_M`."""
     room = max(1, math.ceil(CLEAR_M / plan.resolution))
     taken = np.pad(plan.cells != FREE, room + 1, constant_values=True).astype(np.int64).cumsum(0).cumsum(1)
     rows, columns = plan.cells.shape
@@ -195,10 +197,10 @@ def eyes_of(plan: Plan) -> dict[tuple[int, int], list[Array]]:
 
 
 def image_of_cells(cells: Cells, resolution: float, T_map_cells: Array, identity: Identity) -> MapImage:
-    """The map of these cells; ``T_map_cells``: where the lower left corner of cell [0, 0] lies, and how it is turned.
+    """Map image of these cells; ``T_map_cells``: pose of the lower left corner of cell [0, 0] in the map.
 
     Raises:
-        ValueError: it has no walls, or no free place to stand in.
+        ValueError: it has no walls, or no free position for a robot.
     """
     plan = plan_of(np.ascontiguousarray(cells), resolution)
     squares = eyes_of(plan)
@@ -225,7 +227,7 @@ def image_of_cells(cells: Cells, resolution: float, T_map_cells: Array, identity
 def piece_of(
     plan: Plan, numbers: tuple[int, int], eyes: Sequence[Array], T_map_cells: Array, bearing: Array
 ) -> tuple[Piece, list[Keyframe]]:
-    """A submap at the first of these places, of all that is seen from them, and the scans seen there.
+    """A submap at the first of these positions, of everything visible from them, and the simulated scans.
 
     ``numbers``: its key, and that of its first keyframe.
     """
@@ -257,7 +259,7 @@ def piece_of(
 
 
 def joined(squares: Sequence[tuple[int, int]], pieces: Sequence[Piece]) -> Constraints:
-    """Each submap with the next one and with its neighbours above and to the right: the cells lie where they lie."""
+    """Edges of each submap to the next one and to its neighbours above and to the right; the cells give exact poses."""
     number = {square: k for k, square in enumerate(squares)}
     pairs = {(k, k + 1) for k in range(len(pieces) - 1)}
     for (a, b), k in number.items():

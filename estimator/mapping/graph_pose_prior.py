@@ -1,10 +1,10 @@
-"""The map as a witness of the pose that light holds: what it knows better is taken from it.
+"""Pose prior from the pose graph: adds the map's additional information to the alignment by light.
 
-Light aligns the odom frame with the survey, epoch by epoch. Where it is blind (across a row of lamps, where none are
-lit) the alignment grows vague, though the robot may drive through what it has mapped many times. There the graph knows
-more: by its loops, and by the light at all the submaps. The place by the graph without the alignment is compared with
-the alignment, and in each direction only what the graph knows *more* is added: the two have much in common, and the
-same map seen again adds nothing.
+Light aligns the odom frame with the survey, epoch by epoch. Across collinear lamps, or without lamps, the covariance of
+the alignment grows. The robot may then drive where it has mapped many times. There the graph has more information: from
+its loops, and from light at all the submaps. The pose by the graph without the alignment is compared with the
+alignment. In each direction only the *additional* information of the graph is added. The two are largely correlated,
+and the same map seen again adds nothing.
 """
 
 from __future__ import annotations
@@ -28,21 +28,24 @@ from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE
 
 NARROWEST = 1e-12
-"""Share of the largest eigenvalue below which one of an information is taken for nothing but rounding."""
+"""Share of the largest eigenvalue of an information below which another one is rounding."""
 
 LED_M, LED_RAD = 0.15, 0.05
-"""A map that has moved the robot farther may have been wrong: light that contradicts it then is believed at once."""
+"""Correction by the map (m, rad) above which the map may have been wrong.
+
+Light that then disagrees is followed at once.
+"""
 
 SETTLED_M = 0.01
-"""A robot (m, rad) that has been moved by more has the graph solved about its new place."""
+"""Correction of the robot (m, rad) above which the graph is solved again about its new pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Said:
-    """Where the map has its newest submap, were that not tied to the survey itself.
+    """Pose of the newest submap by the map, without its own prior by the survey.
 
     Attributes:
-        T_map_newest: (3,) as what light has said of the other submaps has it: it does not move along with them.
+        T_map_newest: (3,) by the light at the other submaps; it does not move along with them.
         P: (3, 3) covariance (m, m, rad) in the submap's axes.
     """
 
@@ -51,13 +54,13 @@ class Said:
 
 
 def said(graph: Graph, solution: Solution, ties: Array, how: tuple[int, float, float]) -> Said | None:
-    """The graph's place of its last pose without the last anchor, the alignment; None without another anchor.
+    """The graph's last pose without its last prior, the alignment; None without another prior.
 
     Args:
-        graph: whose last anchor is of the last pose.
-        solution: of it.
+        graph: its last prior is that of the last pose.
+        solution: of the graph.
         ties: (n, 3, 3) of `tied` to the last pose.
-        how: most iterations, when it has settled, and phi, as `optimise` takes them.
+        how: most iterations, convergence threshold, and phi, as arguments of `optimise`.
     """
     last = len(graph.poses) - 1
     others = graph.anchored[:-1]
@@ -72,12 +75,12 @@ def said(graph: Graph, solution: Solution, ties: Array, how: tuple[int, float, f
 
 
 def take(map_: MapState, pose: MapPose, motion: Motion, word: Said) -> None:
-    """Add to the alignment what the map knows more of the newest submap's place.
+    """Add the map's additional information on the newest submap's pose to the alignment.
 
     That moves the robot and this submap alone.
 
-    Nothing is taken while light and pose disagree, while a part of the map is detached or on trial: then it may
-    be the map that is wrong.
+    Nothing is added while light and pose disagree, or while a part of the map is detached or on trial: then the map may
+    be wrong.
     """
     graph, alignment = map_.graph, pose.alignment
     newest = graph.newest
@@ -98,7 +101,7 @@ def take(map_: MapState, pose: MapPose, motion: Motion, word: Said) -> None:
     off = R.T @ off
     P = P_map + alignment.P + map_odom_filter.TOLERANCE
     if not (np.isfinite(P_map).all() and off @ invert3(P) @ off <= SURPRISE):
-        return  # light has the last word
+        return  # where they disagree, light counts
     L_before = invert3(alignment.P)
     G = surplus(invert3(P_map), L_before)
     if not G.any():
@@ -114,12 +117,12 @@ def take(map_: MapState, pose: MapPose, motion: Motion, word: Said) -> None:
 
 
 def surplus(L: Array, than: Array) -> Array:
-    """By how much one information (3, 3) exceeds another: the part of ``L - than`` that is positive.
+    """Positive part of the difference ``L - than`` of two informations (3, 3).
 
-    Positive as seen with ``than`` for a measure, so that it does not depend on units.
+    Its sign is relative to ``than`` as the metric, so that it does not depend on units.
     """
     size, V = np.linalg.eigh(than)
-    size = np.sqrt(np.maximum(size, NARROWEST * size[-1]))  # never singular, whatever rounding has left
+    size = np.sqrt(np.maximum(size, NARROWEST * size[-1]))  # never singular, whatever the rounding
     K = (V / size).T @ L @ (V / size)
     more, U = np.linalg.eigh(0.5 * (K + K.T))
     V = (V * size) @ U

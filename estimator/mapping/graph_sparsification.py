@@ -1,8 +1,8 @@
-"""Which constraints of the graph stay when a place has been driven through so often that it has more than it needs.
+"""Pose-graph sparsification: selects the edges to keep where the same area has been driven through many times.
 
-Every submap that is taken out leaves what it was joined with to a neighbour, so that lap after lap each submap would be
-joined with every other. Of those that a submap has, the surest say next to all that is known; the others cost memory
-and every solution of the graph its time.
+A submap that is removed passes its edges to a neighbour. So after many laps each submap would have an edge to every
+other. The edges with the smallest covariance contain nearly all information. The others cost memory and time in every
+solution of the graph.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from estimator.numerics.arrays import Array, Bools, Ints
 from estimator.numerics.elimination_ordering import NONE
 
 WAYS, LOOPS = 2, 4
-"""Constraints of each kind that a submap keeps for itself; it may have more that the other end keeps."""
+"""Odometry edges and loop edges that a submap keeps for itself; the other end may keep more."""
 
 SLACK: Final = 1.25
-"""They are thinned out when there are so many times more than that: not at every one."""
+"""Sparsification starts at so many times more edges, not at every single one."""
 
 
 def thinned(keys: Ints, joined: Constraints) -> Bools:
-    """Which constraints stay, (m,), all of them while they are few: at most ``WAYS + LOOPS + 1`` a submap, about.
+    """Mask (m,) of the edges to keep, all of them while they are few: about ``WAYS + LOOPS + 1`` a submap at most.
 
-    Never one without which a part of the graph would come loose: of the ways a tree stays, and where ways alone leave
-    several parts, the surest loop between each two of these.
+    An edge that connects two components always stays. Of the odometry edges a spanning tree stays. Where these leave
+    several components, the most certain loop between each two of them stays.
 
     Args:
         keys: of the submaps, rising.
-        joined: constraints between them.
+        joined: edges between them.
     """
     n, m = len(keys), len(joined.loop)
     kept = np.ones(m, np.bool_)
@@ -48,9 +48,10 @@ def thinned(keys: Ints, joined: Constraints) -> Bools:
 
 
 def handed_on(keys: Ints, joined: Constraints, key: int) -> Ints:
-    """Of a submap that is taken out, the constraints that its neighbour gets: rows, in their order.
+    """Rows of the edges that a neighbour takes over from a removed submap, in their order.
 
-    All ways, the surest loops, and where ways alone leave several parts the surest loop to each of the others.
+    These are all odometry edges and the most certain loops. Where odometry edges leave several components, they include
+    the most certain loop to each of the others.
     """
     n, rows = len(keys), joined.of(key)
     loops = rows[joined.loop[rows]]
@@ -66,7 +67,7 @@ def handed_on(keys: Ints, joined: Constraints, key: int) -> Ints:
 
 
 def parts(n: int, edges: Ints, doubtful: Bools) -> tuple[Ints, Ints]:
-    """Of each submap its parent in a tree of ways, and the root of the part it belongs to."""
+    """Parent of each submap in a tree of odometry edges, and the root of its component."""
     order, parent = spanning(n, edges, doubtful, np.ones(n, np.bool_))
     part = np.arange(n)
     for i in order[parent[order] != NONE].tolist():
@@ -75,13 +76,13 @@ def parts(n: int, edges: Ints, doubtful: Bools) -> tuple[Ints, Ints]:
 
 
 def first_of_each(kind: Ints, vague: Array, rows: Ints) -> Ints:
-    """Of these rows the surest one of each kind."""
+    """The most certain one of these rows of each kind."""
     rows = rows[np.argsort(vague[rows], kind="stable")]
     return np.asarray(rows[np.unique(kind[rows], return_index=True)[1]])
 
 
 def pairs(edges: Ints, n: int) -> Ints:
-    """A number for each two ends, whichever comes first."""
+    """A number for each pair of ends, in either order."""
     return np.asarray(edges.min(axis=1) * n + edges.max(axis=1))
 
 
@@ -94,7 +95,7 @@ def vagueness(information: Array) -> Array:
 
 
 def surest(edges: Ints, vague: Array, asked: Bools, most: int) -> Bools:
-    """Those among the ``asked`` that are one of the ``most`` surest at either end; of equals the latest, (m,)."""
+    """Mask (m,) of the ``asked`` edges among the ``most`` most certain ones at either end; of equals the latest."""
     rows = np.flatnonzero(asked)[::-1]
     end, row = edges[rows].T.ravel(), np.concatenate((rows, rows))
     by_end = np.lexsort((vague[row], end))

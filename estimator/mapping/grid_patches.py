@@ -1,11 +1,11 @@
-"""Patches: what one submap says of the cells around it, rendered once; and tiles, what all patches say together.
+"""Occupancy patches of submaps, rendered once each, and tiles: the combined occupancy of all patches.
 
-A patch is laid on the map's own grid at the place where the submap lies when it is rendered, so that it is copied cell
-by cell for as long as the submap stays; one that was moved later is looked up at its nearest cells.
+A patch lies on the map's own grid at the pose of the submap when it is rendered. It is copied cell by cell while the
+submap stays there. After a move, each cell of a tile reads the nearest cell of the patch.
 
-Newer words count first (:func:`lay_under`): a cell takes statements from the newest patch back, each of at most
-:data:`WORD`, until it has heard :data:`ENOUGH`; what was said before that no longer counts. So the map forgets: a table
-that is moved is gone when two newer submaps have looked through the place where it stood.
+Newer patches have priority (:func:`lay_under`). A cell sums the log-odds of the patches from the newest back, each
+limited to :data:`WORD`. The sum ends when their magnitudes reach :data:`ENOUGH`. Older patches do not count. So the map
+forgets: a table that was moved disappears when two newer submaps have seen through its old position.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 Tile = tuple[int, int]
-"""Column and row of a tile: it begins at so many times :data:`SIDE` cells from the map's origin."""
+"""Column and row of a tile; its first cell is that multiple of :data:`SIDE` cells from the map's origin."""
 
 Cells = npt.NDArray[np.int8]
 """(rows, columns), log-odds in :data:`UNIT`; 0 is unknown, positive is occupied."""
@@ -35,15 +35,15 @@ Cells = npt.NDArray[np.int8]
 Shorts = npt.NDArray[np.int16]
 
 Seen = tuple[Array, Keyframe]
-"""A keyframe, and T_submap_lidar: where its lidar was in the frame of its submap."""
+"""A keyframe with its T_submap_lidar: the lidar in the frame of its submap."""
 
 SIDE: Final = 128
 UNIT: Final = 0.1
 WORD, ENOUGH = 50, 80
-"""The most that one patch says of a cell, and what a cell hears in all, in :data:`UNIT`."""
+"""Largest log-odds of one patch in a cell, and of a cell in all, in :data:`UNIT`."""
 
 REACH_M: Final = 30.0
-"""Beams are followed so far; beyond, cells between two of them would be told nothing."""
+"""Length of the beams, m; beyond, cells between two of them would get no data."""
 
 LEVEL: Final = 1
 
@@ -53,9 +53,12 @@ class Patch:
     """Cells of one submap.
 
     Attributes:
-        T_map_submap: where the submap was when this was rendered. corner: column and row, on the map's grid, of cell
-            [0, 0]. shape: rows, columns. reach_m: from the submap's origin to the farthest corner. weight: sum of the
-            sizes of its words. packed: the cells, compressed.
+        T_map_submap: pose of the submap at the rendering.
+        corner: column and row, on the map's grid, of cell [0, 0].
+        shape: rows, columns.
+        reach_m: from the submap's origin to the farthest corner.
+        weight: sum of the magnitudes of its cells.
+        packed: the cells, compressed.
     """
 
     T_map_submap: Array
@@ -70,11 +73,11 @@ class Patch:
         return np.frombuffer(bytearray(zlib.decompress(self.packed)), np.int8).reshape(self.shape)
 
     def moved(self, T_map_submap: Array) -> Array:
-        """What has moved the submap since (the map's frame then to the map's frame now)."""
+        """Motion of the submap since (from the map frame then to the map frame now)."""
         return se2.compose(T_map_submap, se2.inverse(self.T_map_submap))
 
     def corners(self, T_map_submap: Array, resolution: float) -> Array:
-        """(4, 2) corners, m, with the submap at this place."""
+        """(4, 2) corners, m, with the submap at this pose."""
         column, row = self.corner
         rows, columns = self.shape
         x, y = (column, column + columns), (row, row + rows)
@@ -84,14 +87,14 @@ class Patch:
         return se2.apply(self.moved(T_map_submap), still)
 
     def touches(self, T_map_submap: Array, resolution: float) -> frozenset[Tile]:
-        """Tiles that it may lie on, with the submap at this place."""
+        """Tiles that it may overlap, with the submap at this pose."""
         at = self.corners(T_map_submap, resolution) / (SIDE * resolution)
         (x0, y0), (x1, y1) = np.floor(at.min(axis=0) + 1e-9).tolist(), np.floor(at.max(axis=0) - 1e-9).tolist()
         return frozenset((i, j) for i in range(int(x0), int(x1) + 1) for j in range(int(y0), int(y1) + 1))
 
 
 def render(frames: Sequence[Seen], T_map_submap: Array, resolution: float) -> Patch:
-    """The patch of a submap's keyframes; compiled loops of a scan each, with the GIL free."""
+    """The patch of a submap's keyframes; compiled loops of a scan each, without the GIL."""
     drawn = occupancy_grid.render(
         [(se2.compose(T_map_submap, T), shortened(frame.beams())) for T, frame in frames], resolution
     )
@@ -105,7 +108,7 @@ def render(frames: Sequence[Seen], T_map_submap: Array, resolution: float) -> Pa
 
 
 def shortened(beams: Beams) -> Beams:
-    """The beams up to :data:`REACH_M`: what ends beyond is free until there."""
+    """The beams up to :data:`REACH_M`; a longer one is free until there."""
     bearing, distance, kind = beams
     far = (kind == Beam.HIT) & (distance > REACH_M)
     if not far.any():
@@ -115,10 +118,10 @@ def shortened(beams: Beams) -> Beams:
 
 @kernel("i8(i2[:, ::1], i2[:, ::1], i1[:, ::1], f8[::1])", aside=True)
 def lay_under(said: Shorts, heard: Shorts, cells: Cells, how: Array) -> int:
-    """Add an older patch to a tile, as far as its cells have not heard enough; how much of its words counted.
+    """Add an older patch to a tile, as far as its cells are not full; returns the sum of the magnitudes added.
 
-    ``said``, ``heard``: sums of the words that count, and of their sizes. ``how``: column and row in the patch of the
-    middle of the tile's cell [0, 0], and by how much they change with a column of the tile, and with a row.
+    ``said``, ``heard``: sums of the values that count, and of their magnitudes. ``how``: column and row in the patch of
+    the centre of the tile's cell [0, 0]; their change per column, then per row of the tile.
     """
     rows, columns = said.shape
     high, wide = cells.shape
@@ -155,7 +158,7 @@ def affine(patch: Patch, T_map_submap: Array, tile: Tile, resolution: float) -> 
 def compose(
     tiles: Sequence[Tile], newest_first: Iterable[tuple[int, Patch, Array, frozenset[Tile]]], resolution: float
 ) -> tuple[dict[Tile, Cells], dict[tuple[int, Tile], int]]:
-    """What patches (key, patch, T_map_submap, tiles) say of these tiles together, and how much each counts where."""
+    """Combined cells of these tiles from patches (key, patch, T_map_submap, tiles), and how much of each counts."""
     said = {tile: np.zeros((SIDE, SIDE), np.int16) for tile in tiles}
     heard = {tile: np.zeros((SIDE, SIDE), np.int16) for tile in tiles}
     used = {}

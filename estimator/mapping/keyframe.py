@@ -1,4 +1,4 @@
-"""Keyframes (kept scans) and submaps (stretches of the way that the pose graph moves as one piece)."""
+"""Keyframes (kept scans with their pose) and submaps (path segments that the pose graph moves as rigid bodies)."""
 
 from __future__ import annotations
 
@@ -24,28 +24,32 @@ Elements = npt.NDArray[np.float32]
 """Line elements (n, local_map.WIDTH) in the submap's frame; float32 resolves a micrometre over 10 m."""
 
 ANYWHERE = np.diag((1e3, 1e3, 10.0))
-"""Covariance (m, m, rad) of a place that no way joins with the others."""
+"""Covariance (m, m, rad) of a pose without an odometry edge to the others."""
 
 NEAR_M, NEAR_RAD = 0.4, 0.25 * math.pi
-"""What lies nearer together shows the same (see `estimator.mapping.keyframe_selection.retire`)."""
+"""Distance (m, rad) within which keyframes show the same (see `estimator.mapping.keyframe_selection.retire`)."""
 
 LONGEST_M = 1e6
-"""Ranges beyond are kept as this: they say the same, and fit into single precision."""
+"""Largest stored range, m; longer ones mean the same and would exceed single precision."""
 
 
 @dataclass(slots=True, eq=False, weakref_slot=True)
 class Submap:
-    """A stretch of the way, which corrections of the map move as one piece.
+    """A segment of the path that corrections of the map move as one rigid body.
 
     Attributes:
-        key: number, counted from 1. first: ID of its first keyframe, whose place is its own.
-        T_map_submap: follows every correction of the map. T_odom_submap: where it was laid, never changes.
-        way_m: driven until there. settled: what it consists of, once it is finished.
-        light: its place by what light alone said at its surest keyframe, with the covariance; None without.
-        lamps: IDs of the lamps used at any of its keyframes (the paper's S_M, of this stretch).
-        into: another that has taken its place in the graph, and where in that one it lies; None while it stands alone.
-        hung: those that lie in this one and that something still hangs on.
-        strayed: what the way until there may have strayed, see `SubmapGraph.strayed_since`; as given: no way is known.
+        key: number, counted from 1.
+        first: ID of its first keyframe, whose pose is its own.
+        T_map_submap: pose in the map; follows every correction.
+        T_odom_submap: pose when it was created, constant.
+        way_m: path length until there.
+        settled: its content, once it is finished.
+        light: its pose by the light solution at its most certain keyframe, with the covariance; None without.
+        lamps: IDs of the lamps used at any of its keyframes (the paper's S_M, of this segment).
+        into: submap that has replaced it in the graph, and its pose in that one; None while it stands alone.
+        hung: submaps that this one has replaced and that keyframes still refer to.
+        strayed: accumulated covariance of the path until there, see `SubmapGraph.strayed_since`; by default no path is
+            known.
     """
 
     key: int
@@ -61,9 +65,10 @@ class Submap:
     strayed: Array = field(default_factory=lambda: -ANYWHERE)
 
     def hang_on(self, hub: Submap, T_hub_submap: Array) -> None:
-        """Give up its place in the graph, and let what lies in it lie in ``hub`` at once.
+        """Replace this submap by ``hub`` in the graph, together with all submaps that it has replaced.
 
-        Through years of laps each has taken the place of one before; none may be a link of a chain that only grows.
+        Over years of laps each submap replaces an earlier one. Every reference points to ``hub`` directly, so no chain
+        grows.
         """
         for other in (self, *self.hung):
             T = T_hub_submap if other.into is None else se2.compose(T_hub_submap, other.into[1])
@@ -72,7 +77,7 @@ class Submap:
         self.hung.clear()
 
     def place(self) -> Array:
-        """``T_map_submap`` as corrected so far."""
+        """``T_map_submap`` with all corrections so far."""
         if self.into is None:
             return self.T_map_submap
         other, T_other_submap = self.into
@@ -81,13 +86,18 @@ class Submap:
 
 @dataclass(slots=True, eq=False)
 class Keyframe:
-    """A scan kept.
+    """A kept scan.
 
     Attributes:
-        submap: what it hangs on. T_odom_keyframe: where it was laid, never changes.
-        T_base_lidar: mount. bearing_rad: shared with the other keyframes of the same lidar.
-        turned_rad: yaw turned from the first to the last beam. range_m: float32. beam: uint8 of `Beam`.
-        virtual: what light said, None where it said nothing good.
+        key: ID of the keyframe.
+        submap: its submap.
+        T_odom_keyframe: pose when it was created, constant.
+        T_base_lidar: mount.
+        bearing_rad: shared with the other keyframes of the same lidar.
+        turned_rad: yaw turned from the first to the last beam.
+        range_m: float32.
+        beam: uint8 of `Beam`.
+        virtual: the light solution, None where it is not valid.
     """
 
     key: int
@@ -102,30 +112,31 @@ class Keyframe:
 
     @property
     def T_map_keyframe(self) -> Array:
-        """Its place in the map as corrected so far."""
+        """Its pose in the map with all corrections so far."""
         return se2.compose(self.submap.place(), se2.between(self.submap.T_odom_submap, self.T_odom_keyframe))
 
     @property
     def T_odom_lidar(self) -> Array:
-        """The lidar when the keyframe was laid."""
+        """Pose of the lidar when the keyframe was created."""
         return se2.compose(self.T_odom_keyframe, self.T_base_lidar)
 
     def beams(self) -> Beams:
-        """Beams as seen from the scan's end."""
+        """Beams in the lidar's frame at the scan's end."""
         return unturned(self.bearing_rad, self.turned_rad), self.range_m.astype(np.float64), self.beam
 
 
 SIZE = 12
-"""Keyframes in a submap: some three metres of way."""
+"""Keyframes in a submap: some three metres of path."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Settled:
-    """What a finished submap consists of.
+    """Content of a finished submap.
 
     Attributes:
-        elements: of all its keyframes, merged. witness: its middle keyframe, placed in the submap's frame, for what it
-            says of free space. sigma: range noise they were laid with.
+        elements: of all its keyframes, merged.
+        witness: reference scan: its middle keyframe, in the submap's frame, for the free-space test.
+        sigma: range noise assumed for them.
     """
 
     elements: Elements
@@ -133,12 +144,12 @@ class Settled:
     sigma: float
 
     def local(self) -> LocalMap:
-        """The submap as something to match against, in its own frame."""
+        """The submap as a local map, in its own frame."""
         return local_map.index(self.elements.astype(np.float64), np.zeros(2), 1, self.witness)
 
 
 def near(one: Array, other: Array) -> bool:
-    """Whether two keyframes look at the same from the same place; who drives along an axis is well within an eighth."""
+    """Whether two keyframes show the same from the same position; motion along an axis stays within an eighth turn."""
     x, y, yaw = (one - other).tolist()
     return math.hypot(x, y) < NEAR_M and abs(se2.wrap(yaw)) < NEAR_RAD
 
@@ -150,13 +161,13 @@ def square_of(T_map_keyframe: Array) -> Square:
 
 
 def squares_about(T_map_keyframe: Array) -> list[Square]:
-    """The squares in which all are listed that are `near`."""
+    """The squares whose lists contain every keyframe that is `near`."""
     i, j, k = square_of(T_map_keyframe)
     return [(i + a, j + b, (k + c) % 8) for a in (0, -1, 1) for b in (0, -1, 1) for c in (0, -1, 1)]
 
 
 def hanging(frames: Iterable[Keyframe]) -> list[tuple[Submap, list[Keyframe]]]:
-    """Keyframes by what they hang on, in the order in which that was laid."""
+    """Keyframes by submap, in the order of the submaps' creation."""
     groups: dict[int, tuple[Submap, list[Keyframe]]] = {}
     for frame in frames:
         groups.setdefault(frame.submap.first, (frame.submap, []))[1].append(frame)
@@ -164,7 +175,7 @@ def hanging(frames: Iterable[Keyframe]) -> list[tuple[Submap, list[Keyframe]]]:
 
 
 def keep(key: int, T_map: Array, T_odom: Array, scan: Scan, turned_rad: float) -> Keyframe:
-    """Make a keyframe of a scan matched at ``T_odom``; it hangs on a submap of its own."""
+    """Create a keyframe of a scan matched at ``T_odom``, with a submap of its own."""
     return Keyframe(
         key=key,
         submap=Submap(0, key, T_map, T_odom),
@@ -178,7 +189,7 @@ def keep(key: int, T_map: Array, T_odom: Array, scan: Scan, turned_rad: float) -
 
 
 def settle(frames: Sequence[Keyframe], T_odom_submap: Array, sigma: float) -> Settled:
-    """Merge the lines of keyframes (at least one) into one submap whose frame lay at ``T_odom_submap``."""
+    """Merge the lines of keyframes (at least one) into the content of a submap created at ``T_odom_submap``."""
     local = local_map.empty(np.zeros(2))
     placed = [replace(frame, T_odom_keyframe=se2.between(T_odom_submap, frame.T_odom_keyframe)) for frame in frames]
     for frame in placed:

@@ -1,4 +1,4 @@
-"""Keyframes: when one is laid, what it does to the local map, and which are let go again."""
+"""Keyframe selection: when a keyframe is created, the local map update by it, and which keyframes are removed."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from estimator.scan_matching.local_map import MapSettings
 from estimator.scan_matching.match_memory import MatchMemory
 
 PATIENCE = 3
-"""Scans in a row that may fail to match before the local map is begun anew from the present one."""
+"""Consecutive scans without a match before the local map restarts from the present one."""
 
 PATIENCE_S = 1.0
-"""With wheels it goes on for at least so long: they bridge it, and who steps in front of the robot steps away again."""
+"""With odometry that takes at least so long, s: odometry bridges it, and people before the lidar step away again."""
 
 NEAR = 0.4
-"""Keyframes nearer together than this, in steps, are not laid: a robot that stands and trembles lays none."""
+"""Smallest distance of keyframes, in steps: a robot at rest that trembles creates none."""
 
 PASS = SIZE
-"""So many keyframes later the robot has come by again: 3 m of way or half a turn, well beyond what is near."""
+"""Keyframes that separate two passes of one position: 3 m of path or half a turn, well beyond what is near."""
 
 AGAIN = 8
-"""Squares that are looked at anew with each keyframe."""
+"""Squares that are listed again with each keyframe."""
 
 NOTHING = 1e-9 * np.eye(3)
 
@@ -49,18 +49,18 @@ def keyframe_due(
     """Whether the robot has left its newest keyframe, sees something else, or has lost its local map.
 
     Args:
-        map_: to be extended.
-        pose: hangs on the newest keyframe.
+        map_: the map to extend.
+        pose: relative to the newest keyframe.
         motion: after the match.
-        matching: as the match has left it.
+        matching: after the match.
         match: of the present scan.
-        every_step: keyframes come by the count of :func:`count_steps`, not by their distance alone.
+        every_step: keyframes follow the count of :func:`count_steps`, not their distance alone.
     """
     settings = map_.settings
     if matching.local_map is None or not match.ok:
         return lost(motion, matching)
     changed = match.inliers < settings.keyframe_share * match.queries and matching.scans_since_keyframe >= PATIENCE
-    if not every_step:  # the newest keyframe is all of the map, and its error is kept for good
+    if not every_step:  # the newest keyframe is the whole map, and its error stays for good
         return changed or away(map_, pose, motion) > 1.0
     step = math.floor(matching.steps)
     due = changed or (step != map_.newest_step and away(map_, pose, motion) > NEAR)
@@ -69,7 +69,7 @@ def keyframe_due(
 
 
 def lost(motion: Motion, matching: MatchMemory) -> bool:
-    """Whether there is no local map, or none of the scans that have seen something has fitted it for long enough."""
+    """Whether there is no local map, or no usable scan has matched it for long enough."""
     if matching.local_map is None:
         return True
     waited = motion.t_mono - matching.t_match
@@ -77,23 +77,23 @@ def lost(motion: Motion, matching: MatchMemory) -> bool:
 
 
 def away(map_: MapState, pose: MapPose, motion: Motion) -> float:
-    """How far the robot is from its newest keyframe, in keyframes: the larger one of its way and its turn."""
+    """Distance of the robot from its newest keyframe, in keyframes: the larger one of path and rotation."""
     x, y, yaw = se2.between(pose.T_odom_anchor, motion.T_odom_base).tolist()
     return float(max(math.hypot(x, y) / map_.settings.keyframe_m, abs(yaw) / map_.settings.keyframe_rad))
 
 
 def count_steps(settings: MappingSettings, motion: Motion, matching: MatchMemory) -> None:
-    """Count the way since the last scan, by the prediction, in keyframe distances.
+    """Add the predicted path since the last scan, in keyframe distances, to the step count.
 
-    Keyframes are laid where this count passes a whole number, and not at a distance from the last one: so a hair's
-    breadth in one match does not choose other scans for all keyframes to come, and with them another map.
+    A keyframe is created where this count passes a whole number, not at a distance from the last one. So a tiny
+    difference in one match does not select other scans, and with them another map.
     """
     x, y, yaw = se2.between(matching.T_odom_scan, motion.T_odom_base).tolist()
     matching.steps += math.hypot(x, y) / settings.keyframe_m + abs(yaw) / settings.keyframe_rad
 
 
 def make_keyframe(map_: MapState, pose: MapPose, motion: Motion, scan: Scan, turned_rad: float) -> Keyframe:
-    """A keyframe of a scan at the present pose; nothing hangs on it yet."""
+    """Keyframe of a scan at the present pose, without a submap of the graph yet."""
     T = motion.T_odom_base
     frame = keyframe.keep(map_.next_key, pose.here(T), T, scan, turned_rad)
     newest = map_.keyframes.get(pose.anchor)
@@ -103,7 +103,7 @@ def make_keyframe(map_: MapState, pose: MapPose, motion: Motion, scan: Scan, tur
 
 
 def hang_on(map_: MapState, pose: MapPose, motion: Motion, frame: Keyframe) -> Array:
-    """Hang the coming poses on a new keyframe; returns the pose's covariance (3, 3) since the keyframe before."""
+    """Make a new keyframe the anchor; returns the pose's covariance (3, 3) since the previous keyframe."""
     P, T = motion.P, motion.T_odom_base
     pose.P_anchor = turned_back(pose, pose.covariance(T, P))
     motion.P = NOTHING.copy()
@@ -115,7 +115,7 @@ def hang_on(map_: MapState, pose: MapPose, motion: Motion, frame: Keyframe) -> A
 
 
 def lay_anchor(map_: MapState, pose: MapPose, motion: Motion) -> None:
-    """Without a laser no scan is kept; every stretch of the way still hangs on a place that light has given."""
+    """Create an anchor without a scan where light alone gives the pose, once per keyframe distance."""
     alignment, T = pose.alignment, motion.T_odom_base
     near = away(map_, pose, motion) <= 1.0
     if alignment is None or not alignment.placed or not blind(pose, motion) or near:
@@ -134,7 +134,7 @@ def turned_back(pose: MapPose, P_map: Array) -> Array:
 def update_local_map(
     matching: MatchMemory, newest: Keyframe, points: ScanPoints, settings: MapSettings, noise_m: float, anew: bool
 ) -> None:
-    """Merge the newest keyframe into the local map, or begin a new one (``anew``) where the old one is lost."""
+    """Merge the newest keyframe into the local map, or restart it (``anew``) where the old one is lost."""
     local = matching.local_map
     if local is None or anew:
         matching.restarts += local is not None
@@ -144,13 +144,13 @@ def update_local_map(
 
 
 def retire(map_: MapState, newest: Keyframe) -> None:
-    """Bound what is kept per area: near one place, with one heading, the newest few of earlier passes stay.
+    """Limit the stored scans per area: near one position and heading, the newest few of earlier passes stay.
 
-    This pass's own are left alone: in a curve, or where the robot sways, they lie close together. Were all counted by
-    the squares that list them, squares that a lap only touches would go on filling up for hours.
+    Keyframes of the present pass do not count: in a curve, or where the robot sways, they lie close together. A count
+    by list square instead would fill squares that a lap only touches, for hours.
     """
     T, parts = newest.T_map_keyframe, map_.parts
-    # what is detached, or on trial, may lie elsewhere: it takes the place of nothing older
+    # what is detached, or on trial, may lie elsewhere: it replaces no older one
     fixed, on_trial = parts.session_start if parts.fixed else 0, 0 if parts.trial is None else parts.trial.since
     since = max(parts.detached_since, fixed, on_trial)
     here = sorted(key for key, T_key in listed(map_, T, newest.key) if since <= key and near(T, T_key))
@@ -164,10 +164,10 @@ def retire(map_: MapState, newest: Keyframe) -> None:
 
 
 def listed(map_: MapState, T_map: Array, newest: int) -> Iterator[tuple[int, Array]]:
-    """The newest keyframe and those about its place, with theirs; who has moved along with the map is listed anew.
+    """The newest keyframe and those near it, with their poses; each is listed again at its present square.
 
-    So are a few of those that have not been looked at for longest: a map that turns a little moves its far end by
-    metres, where else they would be missed on the next pass.
+    A few of those not listed for the longest time follow. A small rotation of the map moves its far end by metres.
+    There the next pass would miss them.
     """
     about = [newest]
     for square in (*squares_about(T_map), *islice(map_.places, AGAIN)):
@@ -181,7 +181,7 @@ def listed(map_: MapState, T_map: Array, newest: int) -> Iterator[tuple[int, Arr
 
 
 def drop(map_: MapState, key: int) -> None:
-    """Let go of a keyframe's scan."""
+    """Remove a keyframe's scan."""
     gone = map_.keyframes.pop(key)
     if map_.settings.history:
         map_.retired[key] = gone.submap, se2.between(gone.submap.T_odom_submap, gone.T_odom_keyframe)

@@ -1,8 +1,8 @@
-"""The map as tiles that follow the submaps: only those are composed again on which a submap is new, moved or gone.
+"""Live occupancy grid for display: tiles that follow the submaps, composed again only where a submap changes.
 
-The work is done by the background worker, a few patches and tiles at a time (:func:`advance`), and taken in within a
-cycle (:meth:`LiveGrid.take`). Whoever shows the map asks for the tiles that have changed since the version that he has.
-The final map of a replay and the picture of a map file are made by the same code, at once (:func:`at_once`).
+The background worker does the work, a few patches and tiles at a time (:func:`advance`). A cycle applies the result
+(:meth:`LiveGrid.take`). A display requests the tiles that have changed since its own version. The final map of a replay
+and the image of a map file use the same code at once (:func:`at_once`).
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 
 RENDERS, TILES = 2, 4
-"""Patches rendered, and tiles composed, in one job: some 20 ms."""
+"""Most patches rendered, and tiles composed, in one job: some 20 ms."""
 
 MOVED: Final = 0.3
-"""Cells by which a patch must have moved, at its farthest corner, before its tiles are composed again."""
+"""Displacement of a patch's farthest corner, in cells, above which its tiles are composed again."""
 
 EVERY: Final = 4
-"""The submap that is being driven through is shown anew after so many keyframes."""
+"""Keyframes after which the submap under construction is rendered again."""
 
 SPENT: Final = 0.05
-"""Of what a submap says that is out of the graph, so much must still count, or its patch is let go, too."""
+"""Smallest share of a removed submap's patch that must still count, or the patch is removed, too."""
 
 
 class Drawn(NamedTuple):
-    """A patch as it lies in the tiles: where, on which, and how much of it counts in each."""
+    """A patch in the tiles: its pose, the tiles, and the amount that counts in each."""
 
     patch: Patch
     T_map_submap: Array
@@ -45,7 +45,7 @@ class Drawn(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where a submap lies: in the map, or in another one that has taken its place in the graph."""
+    """Pose of a submap: in the map, or in another one that has replaced it in the graph."""
 
     T_map_hub: Array
     T_hub_submap: Array | None
@@ -57,12 +57,16 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """What a job does: fixed when it is handed out.
+    """Input of a job, fixed when it is queued.
 
     Attributes:
-        resolution: m per cell. drawn: patches as they lie in the tiles. places: of all submaps that have a patch or get
-            one. fresh: keyframes of those to be rendered. more: others wait for that, too. spare: keys of
-            submaps that are out of the graph. stale: tiles waiting to be composed.
+        resolution: m per cell.
+        drawn: patches in the tiles.
+        places: poses of all submaps that have a patch or get one.
+        fresh: keyframes of those to be rendered.
+        more: whether others wait for rendering, too.
+        spare: keys of submaps that are out of the graph.
+        stale: tiles waiting to be composed.
     """
 
     resolution: float
@@ -76,7 +80,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Progress:
-    """What a job has done: its task, patches drawn anew, tiles composed, tiles that are still stale, keys let go."""
+    """Result of a job: its task, patches rendered or moved, tiles composed, tiles still stale, keys removed."""
 
     task: Task
     drawn: dict[int, Drawn]
@@ -87,13 +91,17 @@ class Progress:
 
 @dataclass(slots=True, eq=False)
 class LiveGrid:
-    """A map that is kept up to date.
+    """Occupancy grid that is kept up to date.
 
     Attributes:
-        resolution: m per cell. version: counts changes. tiles: cells, and the version they are of.
-        submaps, drawn: by key, those whose patch lies in the tiles. fresh: keyframes of those to be rendered.
-        stale: tiles to be composed again. due: submaps may have moved.
-        rendered, composed: patches and tiles, counted.
+        resolution: m per cell.
+        version: counts changes.
+        tiles: cells, and the version of their last change.
+        submaps, drawn: by key, those whose patch is in the tiles.
+        fresh: keyframes of those to be rendered.
+        stale: tiles to be composed again.
+        due: whether submaps may have moved.
+        rendered, composed: numbers of patches and tiles.
     """
 
     resolution: float
@@ -108,13 +116,13 @@ class LiveGrid:
     composed: int = 0
 
     def laid(self, submap: Submap, frames: Sequence[Keyframe]) -> None:
-        """Show a submap with these keyframes from now on; again, if it has been shown with fewer."""
+        """Add a submap with these keyframes, or render it again with more of them."""
         self.submaps[submap.key] = submap
         self.due = True
         self.fresh[submap.key] = tuple((se2.between(submap.T_odom_submap, f.T_odom_lidar), f) for f in frames)
 
     def task(self, detached: float = math.inf) -> Task:
-        """The next piece of work; it finds out itself what has moved. Submaps from key ``detached`` on are left out."""
+        """The next job's input, without submaps from key ``detached`` on; the job itself finds what has moved."""
         ready = sorted(key for key in self.fresh if key < detached)
         fresh = {key: self.fresh[key] for key in ready[:RENDERS]}
         self.due = False
@@ -124,10 +132,10 @@ class LiveGrid:
         return Task(self.resolution, dict(self.drawn), places, fresh, len(ready) > RENDERS, spare, self.stale)
 
     def take(self, done: Progress) -> None:
-        """Take in what a job has done."""
+        """Apply the result of a job."""
         self.drawn.update(done.drawn)
         for key, frames in done.task.fresh.items():
-            if self.fresh.get(key) is frames:  # nothing has been added to it meanwhile
+            if self.fresh.get(key) is frames:  # it has got no keyframe meanwhile
                 del self.fresh[key]
         for key in done.gone:
             if key not in self.fresh:
@@ -140,16 +148,16 @@ class LiveGrid:
         self.tiles.update((tile, (self.version, cells)) for tile, cells in changed.items())
 
     def differs(self, tile: Tile, cells: Cells) -> bool:
-        """Whether a tile has other cells than the ones that were shown."""
+        """Whether a tile's cells differ from those published."""
         shown = self.tiles.get(tile)
         return bool(cells.any()) if shown is None else not np.array_equal(shown[1], cells)
 
     def busy(self, detached: float = math.inf) -> bool:
-        """Whether there is work, or may be because submaps were moved; arguments as of :meth:`task`."""
+        """Whether there is work, or may be because submaps have moved; arguments as of :meth:`task`."""
         return bool(self.stale) or self.due or any(key < detached for key in self.fresh)
 
     def clear(self) -> None:
-        """Forget the map; whoever has seen its tiles is told that they are empty."""
+        """Clear the map; all published tiles change to empty ones."""
         self.version += bool(self.tiles)
         empty = np.zeros((SIDE, SIDE), np.int8)
         self.tiles = dict.fromkeys(self.tiles, (self.version, empty))
@@ -183,12 +191,12 @@ class LiveGrid:
 
 
 def follow(live: LiveGrid | None, graph: SubmapGraph, before: Submap | None, frames: Sequence[Keyframe]) -> None:
-    """A keyframe was laid; before it, ``before`` was the newest submap, with these keyframes."""
+    """Update after a new keyframe; ``before`` was the newest submap before it, with these keyframes."""
     newest = graph.newest
     if live is None or newest is None:
         return
     if newest is not before:
-        if newest.key == graph.parts.detached:  # what was detached before has never been placed
+        if newest.key == graph.parts.detached:  # what was detached before was never attached
             live.fresh = {key: seen for key, seen in live.fresh.items() if key < newest.key}
         if before is not None:
             live.laid(before, frames)
@@ -199,14 +207,14 @@ def follow(live: LiveGrid | None, graph: SubmapGraph, before: Submap | None, fra
 
 
 def begin(live: LiveGrid | None, keyframes: Iterable[Keyframe]) -> None:
-    """Show what a restored map holds."""
+    """Add the submaps of a restored map."""
     if live is not None:
         for submap, frames in hanging(keyframes):
             live.laid(submap, frames)
 
 
 def redraw(live: LiveGrid | None, graph: SubmapGraph, keyframes: Iterable[Keyframe]) -> None:
-    """The map has become another one: show what it holds now; an answer that shows the other is not waited for."""
+    """Restart with the contents of another map; the result of a running job is dropped."""
     if live is not None:
         graph.jobs.cancel(live)
         live.clear()
@@ -214,7 +222,7 @@ def redraw(live: LiveGrid | None, graph: SubmapGraph, keyframes: Iterable[Keyfra
 
 
 def forget(live: LiveGrid | None, graph: SubmapGraph, first: int) -> None:
-    """The submaps from key ``first`` on are taken out of the map; an answer that still shows them is not waited for."""
+    """Remove the submaps from key ``first`` on; the result of a running job is dropped."""
     if live is None:
         return
     graph.jobs.cancel(live)
@@ -225,7 +233,7 @@ def forget(live: LiveGrid | None, graph: SubmapGraph, first: int) -> None:
 
 
 def go_on(live: LiveGrid | None, graph: SubmapGraph) -> None:
-    """Hand out the next piece of work, if there is any and none is under way."""
+    """Queue the next job, if there is work and none is running."""
     detached = math.inf if graph.parts.detached is None else graph.parts.detached
     if live is None or not live.busy(detached) or graph.jobs.busy(live):
         return
@@ -239,7 +247,7 @@ def go_on(live: LiveGrid | None, graph: SubmapGraph) -> None:
 
 
 def place_of(submap: Submap) -> Place:
-    """Where a submap lies now, without computing anything: places are replaced, never changed."""
+    """Present pose of a submap, without computation: pose arrays are replaced, never changed."""
     if submap.into is None:
         return Place(submap.T_map_submap, None)
     hub, T_hub_submap = submap.into
@@ -249,7 +257,7 @@ def place_of(submap: Submap) -> Place:
 
 
 def advance(task: Task) -> Progress:
-    """Render, find what has moved, compose some of the stale tiles. Changes nothing: the answer tells what is new."""
+    """Render, find what has moved, compose some of the stale tiles; changes nothing but its result."""
     fresh = {}
     stale = set(task.stale)
     for key, place in task.places.items():
@@ -267,7 +275,7 @@ def advance(task: Task) -> Progress:
 
 
 def composed(task: Task, fresh: dict[int, Drawn], stale: set[Tile]) -> Progress:
-    """Compose some of the stale tiles, with the patches as they lie from now on."""
+    """Compose some of the stale tiles, with the patches at their new poses."""
     lying = {**task.drawn, **fresh}
     now = [] if task.more else sorted(stale)[:TILES]
     order = [(key, one.patch, one.T_map_submap, one.tiles) for key, one in sorted(lying.items(), reverse=True)]
@@ -281,7 +289,7 @@ def composed(task: Task, fresh: dict[int, Drawn], stale: set[Tile]) -> Progress:
 
 
 def shift(shown: Drawn, T_map_submap: Array) -> float:
-    """By how much, m, a patch lies elsewhere than it is drawn, at most."""
+    """Largest displacement (m) of a patch from its pose in the tiles."""
     if T_map_submap is shown.T_map_submap:
         return 0.0
     x, y, yaw = T_map_submap.tolist()
@@ -290,12 +298,12 @@ def shift(shown: Drawn, T_map_submap: Array) -> float:
 
 
 def spent(one: Drawn, stale: frozenset[Tile]) -> bool:
-    """Whether next to nothing that a patch says counts any more."""
+    """Whether next to nothing of a patch counts any more."""
     return not one.tiles & stale and sum(one.used.values()) < SPENT * max(1, one.patch.weight)
 
 
 def at_once(pieces: Iterable[tuple[Submap, Sequence[Keyframe]]], resolution: float) -> Grid:
-    """The map of these submaps, oldest first, with the keyframes that hang on each, all in one go.
+    """Grid of these submaps, oldest first, with their keyframes, in one go.
 
     Raises:
         ValueError: the resolution is not positive, or the map would have too many cells.

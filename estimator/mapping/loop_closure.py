@@ -1,8 +1,8 @@
-"""Closing loops (Sect. 4.3): what happens to the map when the robot comes back.
+"""Loop closure (Sect. 4.3): candidates, consensus of loops, graph update, and correction of the map.
 
-Nothing here delays a cycle. What takes long is handed out as a job (settle a submap, look for a loop, solve the graph)
-whose answer comes back as a record of a later step. ``T_odom_base`` never hears of it. Without light the correction
-goes into ``T_map_odom``; with light that has placed the map, it moves what was laid before, and light moves the robot.
+Nothing here delays a cycle. Long work runs as a job: finish a submap, search for a loop, solve the graph. Its result is
+a record of a later step. ``T_odom_base`` never changes. Without light the correction goes into ``T_map_odom``. With
+light that has aligned the map, it moves the older submaps, and light moves the robot.
 """
 
 from __future__ import annotations
@@ -32,37 +32,37 @@ from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE, Loop, LoopReason
 
 LOOP_SEARCH: Final = "search for a loop"
-"""Owner of the job that looks for one."""
+"""Owner of the job that searches for a loop."""
 
 PHI: Final = 25.0
-"""chi2 of three degrees of freedom at which a loop keeps a quarter of its weight: real rooms bend more than noise."""
+"""chi2 of three degrees of freedom at which a loop keeps a quarter of its weight: real maps deform more than noise."""
 
 SETTLED: Final = 1e-5
 MOST: Final = 100
 TOGETHER: Final = 60
-"""Keyframes, at most, between two loops that support each other."""
+"""Most keyframes between two loops of one consensus."""
 
 TURNED: Final = 1.05
-"""Turned by so much (rad), a lidar that sees half the horizon sees another part of the surroundings."""
+"""Rotation (rad) after which a lidar with half the horizon sees another part of the surroundings."""
 
 TREMBLE: Final = np.diag((0.005**2, 0.005**2, 0.003**2))
-"""What a correction of the map is uneven by."""
+"""Covariance of the variation of a map correction."""
 
 AS_ONE: Final = 1e-6
-"""Rounding (m, rad) of submaps that were moved together."""
+"""Rounding (m, rad) of submaps that moved together."""
 
 
 def take_answer(map_: MapState, pose: MapPose, motion: Motion, answer: Answer) -> None:
-    """Take in what a job has found."""
+    """Apply a job result, and continue with the graph and the live grid."""
     map_.graph.jobs.answer(answer)
     solve_graph(map_, pose, motion)
     live_grid.go_on(map_.live, map_.graph)
 
 
 def add_keyframe(map_: MapState, pose: MapPose, frame: Keyframe, odometry: tuple[Array, float, bool]) -> None:
-    """Hang a new keyframe on the graph and look whether this place is known.
+    """Add a new keyframe to the graph and search for a loop where one is due.
 
-    ``odometry``: covariance since the keyframe before, range noise, and whether the local map was lost, see
+    ``odometry``: covariance since the previous keyframe, range noise, and whether the local map was lost, see
     `SubmapGraph.add`.
     """
     graph, loops = map_.graph, map_.settings.loops
@@ -74,7 +74,7 @@ def add_keyframe(map_: MapState, pose: MapPose, frame: Keyframe, odometry: tuple
 
 
 def look_back(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame: Keyframe) -> None:
-    """Hand out the search for a keyframe in the submaps that may lie here."""
+    """Queue the search of a keyframe in the submaps that may contain it."""
     asked = candidates(graph, pose, settings, frame)
     if not asked:
         return
@@ -89,16 +89,16 @@ def look_back(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame: 
 
 
 def candidates(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
-    """The nearest submaps that may be where the keyframe is, and were not left only just now."""
+    """The nearest submaps that may contain the keyframe, without those of the path just driven."""
     T = frame.T_map_keyframe
     here_x, here_y, _ = T.tolist()
     near, left_before, most_m = [], graph.way_m - settings.recent_m, settings.most_m
-    vaguest = placed_trace(pose)  # no submap is less certain, so that most are passed over without knowing how much
+    vaguest = placed_trace(pose)  # upper bound for every submap, so most are excluded without their own covariance
     for submap in graph.of_part(frame.submap):
         settled = submap.settled
         if settled is None or submap.way_m >= left_before:
             continue
-        x, y, _ = submap.T_map_submap.tolist()  # most of a large map is passed over here, so it is done by hand
+        x, y, _ = submap.T_map_submap.tolist()  # most of a large map ends here, so it is done by hand
         u, v, _ = settled.witness.T_odom_keyframe.tolist()
         if math.hypot(x - here_x, y - here_y) >= most_m + math.hypot(u, v):
             continue
@@ -111,7 +111,7 @@ def candidates(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame:
             P = certainty(graph, pose, submap, frame)
             if far >= settings.reach_m + 3.0 * math.sqrt(float(P[0, 0] + P[1, 1])):
                 continue
-        # who looks the other way sees little of the same
+        # with the opposite heading a lidar sees little of the same
         near.append((far + settings.turned_m * (1.0 - math.cos(yaw)), submap.key, submap, settled))
     near.sort(key=lambda one: one[:2])
     made = []
@@ -123,7 +123,7 @@ def candidates(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame:
 
 
 def certainty(graph: SubmapGraph, pose: MapPose, submap: Submap, frame: Keyframe) -> Array:
-    """Covariance (map axes) of the newest keyframe relative to a submap: by the way, by loops, or by light."""
+    """Covariance (map axes) of the newest keyframe relative to a submap: by the path, by loops, or by light."""
     P = graph.apart(submap, frame.T_odom_keyframe)
     alignment = pose.alignment
     if alignment is not None and np.trace(P) > placed_trace(pose):
@@ -132,13 +132,13 @@ def certainty(graph: SubmapGraph, pose: MapPose, submap: Submap, frame: Keyframe
 
 
 def placed_trace(pose: MapPose) -> float:
-    """Trace of the covariance (any axes) by which light has placed the pose; without end where it has not."""
+    """Trace of the covariance (any axes) of the pose by light; infinite where light has not aligned the map."""
     alignment = pose.alignment
     return float(np.trace(alignment.P)) if alignment is not None and alignment.placed else math.inf
 
 
 def lit(pose: MapPose) -> bool:
-    """Whether light has told where the map lies, and so holds the pose in it."""
+    """Whether light has aligned the map, and so determines the pose in it."""
     return pose.alignment is not None and pose.alignment.placed
 
 
@@ -149,16 +149,16 @@ def turned(pose: MapPose, P_odom: Array) -> Array:
 
 
 def found_again(graph: SubmapGraph, settings: LoopSettings, frame: Keyframe, found: Found) -> None:
-    """Accept a loop, or let it wait for others that agree where it would move the pose far."""
+    """Accept a loop, or let it wait for others that agree where its correction is large."""
     if found.key not in graph.submaps or graph.submaps.get(frame.submap.key) is not frame.submap:
-        return  # forgotten meanwhile, and its key may have been given to another
-    if not found.alone:  # places repeat here: what has agreed so far may have been the other one all along
+        return  # removed meanwhile, and its key may have been reused
+    if not found.alone:  # the surroundings repeat here: earlier agreement may have been at the other position
         graph.waiting = []
         return
     one = Waiting(found, frame, se2.compose(found.T_submap_keyframe, se2.inverse(frame.T_odom_keyframe)))
     if (
         not within(found.moved, settings, 1.0) and found.reason is not LoopReason.LIT
-    ):  # there light is the second witness
+    ):  # for that reason light has confirmed it
         friends = supporters(graph, settings, one)
         far = min(math.hypot(*found.moved[:2]), settings.most_m)
         if not friends or max(apart(one, other) for other in friends) < far:
@@ -168,7 +168,7 @@ def found_again(graph: SubmapGraph, settings: LoopSettings, frame: Keyframe, fou
         for other in friends:
             join(graph, other.frame, replace(other.found, reason=LoopReason.SUPPORTED))
         found = replace(found, reason=LoopReason.SUPPORTED)
-    graph.waiting = [  # the others are refuted, or were left long ago
+    graph.waiting = [  # the others are refuted, or too old
         other
         for other in graph.waiting
         if comparable(graph, one, other) and within(off(graph, one, other), settings, 1.0)
@@ -177,7 +177,7 @@ def found_again(graph: SubmapGraph, settings: LoopSettings, frame: Keyframe, fou
 
 
 def supporters(graph: SubmapGraph, settings: LoopSettings, one: Waiting) -> list[Waiting]:
-    """The loops that agree with this one, newest first, as far back as none contradicts it."""
+    """The loops that agree with this one, newest first, back to the first that contradicts it."""
     friends: list[Waiting] = []
     for other in reversed(graph.waiting):
         if not comparable(graph, one, other):
@@ -190,25 +190,25 @@ def supporters(graph: SubmapGraph, settings: LoopSettings, one: Waiting) -> list
 
 
 def apart(one: Waiting, other: Waiting) -> float:
-    """How far apart (m) two keyframes lie; without end where the robot has turned to see what was behind it.
+    """Distance (m) of two keyframes; infinite where the rotation has shown the robot another side.
 
-    Where the surroundings repeat, a place that is off by a period fits as well as the true one while the latter is
-    beyond the end of the map. It no longer can once as much has been driven as the loop would move the pose: the place
-    that was found has then been reached by who had not been there yet, and is found as such.
+    In repeating surroundings a position off by one period fits too, while the true one is not mapped. That ends when
+    the path is as long as the loop's correction. The true position has then been reached and mapped, and a match finds
+    it there.
     """
     x, y, yaw = se2.between(other.frame.T_odom_keyframe, one.frame.T_odom_keyframe).tolist()
     return math.inf if abs(yaw) > TURNED else math.hypot(x, y)
 
 
 def comparable(graph: SubmapGraph, one: Waiting, other: Waiting) -> bool:
-    """Whether two loops tell of the same stretch of the way, in submaps that are still there."""
+    """Whether two loops concern the same segment of the path, in submaps that still exist."""
     laid = other.frame.submap
     there = one.found.key in graph.submaps and other.found.key in graph.submaps and graph.submaps.get(laid.key) is laid
     return there and one.frame.key - other.frame.key <= TOGETHER
 
 
 def off(graph: SubmapGraph, one: Waiting, other: Waiting) -> Array:
-    """How far (x, y, yaw) the place where one loop puts its keyframe is from where another one would put it."""
+    """Difference (x, y, yaw) of a keyframe's pose by its own loop and by another one."""
     a, b = graph.submaps[one.found.key], graph.submaps[other.found.key]
     T_b_a = se2.between(b.T_map_submap, a.T_map_submap)
     there = se2.compose(other.T_found_odom, one.frame.T_odom_keyframe)
@@ -216,13 +216,13 @@ def off(graph: SubmapGraph, one: Waiting, other: Waiting) -> Array:
 
 
 def within(moved: Array, settings: LoopSettings, share: float) -> bool:
-    """Whether a pose is moved by less than this share of what asks for support."""
+    """Whether a correction is smaller than this share of the limit for consensus."""
     x, y, yaw = moved.tolist()
     return math.hypot(x, y) <= share * settings.supported_m and abs(yaw) <= share * settings.supported_rad
 
 
 def join(graph: SubmapGraph, frame: Keyframe, found: Found) -> None:
-    """Add a loop to the graph: from the submap that was found to the one that the keyframe hangs on."""
+    """Add a loop to the graph: an edge from the matched submap to the keyframe's submap."""
     T_keyframe_submap = se2.between(frame.T_odom_keyframe, frame.submap.T_odom_submap)
     R, A = se2.rotation(-found.T_submap_keyframe[2]), se2.adjoint(se2.inverse(T_keyframe_submap))
     P = A @ R @ found.P @ R.T @ A.T
@@ -234,7 +234,7 @@ def join(graph: SubmapGraph, frame: Keyframe, found: Found) -> None:
 
 
 def solve_graph(map_: MapState, pose: MapPose, motion: Motion) -> None:
-    """Hand out the graph, if it has changed and is not being solved."""
+    """Queue the solution of the graph, if it has changed and is not being solved."""
     graph = map_.graph
     newest, detached = graph.newest, graph.parts.detached
     begun = newest is not None and (detached is None or newest.key >= detached)
@@ -259,7 +259,7 @@ def solve_graph(map_: MapState, pose: MapPose, motion: Motion) -> None:
 
 
 def solved(graph: Graph) -> tuple[Solution, Array, graph_pose_prior.Said | None]:
-    """The graph's solution, how surely the newest submap lies to each (`tied`), and what the map says of its place."""
+    """The graph's solution, relative covariances of the newest submap (`tied`), and the map's prior of its pose."""
     last = len(graph.poses) - 1
     solution = optimise(graph, MOST, SETTLED, PHI, covariance_of=last)
     ties = tied(graph, solution.poses, solution.trust, last)
@@ -267,7 +267,7 @@ def solved(graph: Graph) -> tuple[Solution, Array, graph_pose_prior.Said | None]
 
 
 def graph_of(graph: SubmapGraph, pose: MapPose, submaps: tuple[Submap, ...]) -> Graph:
-    """The submaps as a graph: joined by the way and by loops, and anchored where light has told a place."""
+    """The submaps as a graph: edges by odometry and loops, and absolute priors by light."""
     joined = graph.constraints
     keys = np.array([submap.key for submap in submaps])
     poses = np.array([submap.T_map_submap for submap in submaps])
@@ -282,7 +282,7 @@ def graph_of(graph: SubmapGraph, pose: MapPose, submaps: tuple[Submap, ...]) -> 
 
 
 def anchors(graph: SubmapGraph, pose: MapPose, keys: Ints) -> tuple[Ints, Array, Array]:
-    """Absolute constraints: what light said at earlier submaps, and where the pose holds the newest."""
+    """Absolute priors: the light solutions at earlier submaps, and the alignment at the newest."""
     newest, alignment = graph.newest, pose.alignment
     assert newest is not None
     assert alignment is not None
@@ -294,9 +294,9 @@ def anchors(graph: SubmapGraph, pose: MapPose, keys: Ints) -> tuple[Ints, Array,
 
 
 def information(at: Array, P_map: Array) -> Array:
-    """Of places (n, 3), upper triangles (n, 6) in their own axes, from their covariances (n, 3, 3) in the map's.
+    """Information (upper triangles, (n, 6)) of poses (n, 3) in their own axes, from covariances (n, 3, 3) in map axes.
 
-    All at once: this is done in a cycle, and one by one it took 2 ms of it with a hundred places.
+    It is vectorised because it runs in a cycle; one by one it took 2 ms of it with a hundred poses.
     """
     R, c, s = np.zeros(P_map.shape), np.cos(at[:, 2]), np.sin(at[:, 2])
     R[:, 0, 0] = R[:, 1, 1] = c
@@ -307,12 +307,12 @@ def information(at: Array, P_map: Array) -> Array:
 
 
 def along(submaps: tuple[Submap, ...], before: Array, solution: Solution, ties: Array) -> tuple[Array, Solution, Array]:
-    """Take a solution along where the whole map has moved as one since, as it does while light finds out where it lies.
+    """Transform a solution where the whole map has moved as one body since, as while light still aligns it.
 
-    Such a map may move with every epoch; if its solutions were thrown away for that, no loop would ever correct it.
+    Such a map may move with every epoch. If its solutions were rejected for that, no loop would ever correct it.
 
-    ``before`` (n, 3) are the places of the submaps that the solution has begun from, ``ties`` (n, 3, 3) came with it.
-    Returns these, the solution and the ties as they would be had the map moved before; unchanged where it did not.
+    ``before`` (n, 3) are the submap poses at the start of the solution; ``ties`` (n, 3, 3) came with it. Returns these,
+    the solution and the ties as if the map had moved before; unchanged where it did not move as one.
     """
     now = np.array([submap.T_map_submap for submap in submaps])
     there = np.array([submap.into is None for submap in submaps[:-1]], np.bool_)
@@ -336,12 +336,12 @@ def along(submaps: tuple[Submap, ...], before: Array, solution: Solution, ties: 
 def correct(
     map_: MapState, pose: MapPose, motion: Motion, submaps: tuple[Submap, ...], result: tuple[Array, Solution]
 ) -> bool:
-    """Move the submaps to where the graph has them, and the robot with the newest one, unless light holds it.
+    """Move the submaps to their solved poses, and the robot with the newest one unless light gives its pose.
 
-    ``result``: places (n, 3) of the submaps that the solution has begun from, and the solution.
+    ``result``: poses (n, 3) of the submaps at the start of the solution, and the solution.
 
-    Returns whether it did: a solution of what has been moved or forgotten meanwhile is thrown away, and the graph
-    solved once more.
+    Returns whether it did. If submaps have moved or been removed meanwhile, the solution is rejected, and the graph is
+    solved again.
     """
     graph, (before, solution) = map_.graph, result
     newest = graph.newest
@@ -375,15 +375,15 @@ def correct(
         if pose.alignment is not None and graph.parts.fixed:
             map_odom_filter.hang_on_anchor(pose, motion)
     else:
-        graph.stale = True  # the newest one's certainty is not known yet
+        graph.stale = True  # the newest one's covariance is not known yet
     return True
 
 
 def surer(pose: MapPose, P_graph: Array, T_map_odom_before: Array) -> Array:
-    """Covariance (odom axes) of the newest keyframe's place in the map after the graph has moved it.
+    """Covariance (odom axes) of the newest keyframe's pose in the map after a correction by the graph.
 
-    The graph reckons with what real rooms bend a stretch by at worst, so that its loops may be believed. A loop takes
-    nothing from what matching itself knew of the place, unless it finds it elsewhere than that allows.
+    The graph allows for the largest deformation of real maps, so that its loops are accepted. A loop does not increase
+    the covariance that matching had, unless the correction exceeds it.
     """
     T_anchor = pose.T_odom_anchor
     off = se2.compose(pose.T_map_odom, T_anchor) - se2.compose(T_map_odom_before, T_anchor)

@@ -1,12 +1,12 @@
-"""Scan to map (Sect. 4.3): whether a keyframe has been at the place of an earlier submap before, and how sure that is.
+"""Loop verification (Sect. 4.3): match of a keyframe to an earlier submap, and the conditions of a loop closure.
 
-Step 2 of the paper, where enough links are clear: the lamps in view must be known in the submap (`IDS`; the paper asks
-for all of them), and what light alone said of both places must agree with the match (`LIGHT`). Where they are not,
-registration is by laser only.
-Step 3: data association by the matcher, and then the threshold on the residual (`SSE`), the share of beams that fit
-(`OVERLAP`), what speaks against it (`AGAINST`: beams that look through the map, points that hang in free space), no
-axis left open (`RANK`), and the place where it was expected (`PLACE`). Where the pose is vague a wide search offers
-several places: if two of them pass, nothing is closed.
+Step 2 of the paper applies where enough links are clear. The lamps in view must be known in the submap (`IDS`; the
+paper requires all of them). The light solutions at both positions must agree with the match (`LIGHT`). Otherwise
+registration is by lidar only.
+Step 3 is data association by the matcher, followed by thresholds. They limit the residual (`SSE`), the share of beams
+that fit (`OVERLAP`) and the free-space violation (`AGAINST`). They require all axes (`RANK`), and the expected position
+(`PLACE`). Where the predicted pose is uncertain, a wide search gives several positions. If two of them pass, no loop is
+closed.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from estimator.scan_matching.local_map import LocalMap, contradicted
 from estimator.scan_matching.scan_matcher import MatchSettings, Prior, View, match
 
 DOUBT: Final = 2.0
-"""By how much the variance of a position from light is raised: its errors hang together farther than it knows."""
+"""Inflation of the variance of a light position: its errors are correlated over longer times than it assumes."""
 
 BLURRED: Final = np.diag((0.05**2, 0.05**2, 0.02**2))
-"""Covariance of what stamps, lever arms and the bending of a submap make of the difference of two places by light."""
+"""Covariance of stamp errors, lever arms and submap deformation in the difference of two light solutions."""
 
 
 class Condition(Enum):
-    """A judgement that a loop has to pass; any subset may be asked for (`LoopSettings.conditions`)."""
+    """A condition of a loop; any subset may be in use (`LoopSettings.conditions`)."""
 
     IDS = "the lamps in view are known in the submap"
     LIGHT = "what light alone said of both places agrees with the match"
@@ -48,26 +48,32 @@ class Condition(Enum):
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
-    """When a loop is one.
+    """Thresholds of loop closure.
 
     Attributes:
-        conditions: which judgements are made at all; what follows says how strict each is. `IDS` is left out: where
-            every lamp in view must be known in one submap, every fifth right loop is lost and none that is wrong.
-        links: how many links must be clear for light to have a say (Link_n).
-        light: largest squared Mahalanobis distance (3 degrees of freedom; 16.3 is 99.9 %) between the match and what
-            light alone says. place: the same between the match and the expected place.
-        shared: least share of the lamps in view that must be known in the submap (the paper: 1).
+        conditions: conditions in use; the other fields are their thresholds. `IDS` is not used by default. With
+            all lamps in view required in one submap, every fifth correct loop is lost and no wrong one.
+        links: fewest clear links for the use of light (Link_n).
+        light: largest squared Mahalanobis distance (3 degrees of freedom; 16.3 is 99.9 %) between the match and the
+            light solution.
+        place: the same between the match and the expected pose.
+        shared: smallest share of the lamps in view that must be known in the submap (the paper: 1).
         sse_m: largest root mean square distance of the fitting beams from the map's surfaces (the paper's threshold).
-        share: least share of the beams that fit. against: largest share of the evidence that speaks against.
-        extra_m, extra_rad: errors of a match that its own covariance does not know: bent submaps, moved furniture.
-        recent_m: way back over which a submap is no loop but the way just driven.
-        reach_m: how near, beyond three deviations, a submap must be to be looked at; most_m: however uncertain.
-        candidates: submaps looked at for one keyframe. turned_m: half by how much nearer one that looks the same way is
-            than one that looks the other way. every: a look for every so many keyframes.
-        sure_m, sure_rad: deviations of the expected place up to which the matcher finds it by itself.
-        points: of a scan, at most. places: that a wide search may offer; two of them that fit close nothing.
-        supported_m, supported_rad: a loop that moves the pose by more than this waits for others that agree within half
-            of this, over as much way as it moves the pose (or a turn); one in between that is off by more refutes them.
+        share: smallest inlier share.
+        against: largest free-space violation.
+        extra_m, extra_rad: errors of a match outside its covariance: deformed submaps, moved furniture.
+        recent_m: path length back to the newest submap that can give a loop.
+        reach_m: largest distance of a candidate, beyond three sigma.
+        most_m: largest distance, however uncertain.
+        candidates: most submaps searched for one keyframe.
+        turned_m: half of the distance by which a submap with the opposite heading ranks behind one with the same.
+        every: keyframes between two searches.
+        sure_m, sure_rad: sigma of the expected pose up to which the matcher needs no wide search.
+        points: of a scan, at most.
+        places: most positions of a wide search; two of them that fit close no loop.
+        supported_m, supported_rad: correction above which a loop waits for others that agree within half of it. These
+            must cover a path as long as the correction (or a rotation); one in between that differs by more refutes
+            them.
     """
 
     conditions: frozenset[Condition] = frozenset(Condition) - {Condition.IDS}
@@ -96,11 +102,11 @@ class LoopSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """What light alone, at keyframe and submap, says of the one seen from the other.
+    """Relative pose of a keyframe and a submap by the light solutions at both.
 
     Attributes:
-        T_submap_keyframe, P: where, with the covariance (3x3, axes of the submap). shared: share of the lamps in view
-            of the keyframe that are known in the submap.
+        T_submap_keyframe, P: the pose, with the covariance (3x3, axes of the submap).
+        shared: share of the lamps in view of the keyframe that are known in the submap.
     """
 
     T_submap_keyframe: Array
@@ -110,9 +116,9 @@ class Told:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A submap in which the keyframe may be seen again: where, with the covariance of that guess (3x3, its axes).
+    """A submap that may contain the keyframe: expected pose there, with its covariance (3x3, its axes).
 
-    ``told``: by light, None where it is paused or has never seen the submap.
+    ``told``: the pose by light, None where light is paused or has never seen the submap.
     """
 
     key: int
@@ -124,14 +130,18 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """A keyframe found again in submap ``key``.
+    """A match of a keyframe in submap ``key``.
 
     Attributes:
-        T_submap_keyframe: where; P: covariance (3x3, axes of the submap). share, against, residual_m: how well.
-        moved: (x, y, yaw) from where it was expected, in the keyframe's axes. reason: which conditions it passed.
-        known: whether no axis is open. off: squared Mahalanobis distance from the expected place; light: from what
-            light says, None where it says nothing. shared: as of `Told`. alone: whether no other place passed too;
-            where one did it is no loop, but says that the surroundings repeat.
+        T_submap_keyframe, P: the pose and its covariance (3x3, axes of the submap).
+        share, against, residual_m: inlier share, free-space violation and residual.
+        moved: (x, y, yaw) from the expected pose, in the keyframe's axes.
+        reason: conditions that it passed.
+        known: whether every axis is known.
+        off: squared Mahalanobis distance from the expected pose.
+        light: the same from the light solution, None without one.
+        shared: as of `Told`.
+        alone: whether no other position passed. Otherwise it is no loop, but shows that the surroundings repeat.
     """
 
     key: int
@@ -150,13 +160,13 @@ class Found:
 
 
 def look(frame: Keyframe, candidates: tuple[Candidate, ...], settings: LoopSettings) -> tuple[Found, ...]:
-    """Look for a keyframe in each of the candidates."""
+    """Search a keyframe in each of the candidates."""
     found = (look_in(frame, candidate, settings) for candidate in candidates)
     return tuple(one for one in found if one is not None)
 
 
 def look_in(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> Found | None:
-    """Look for a keyframe in one submap; what is found is a loop only if it is ``alone``."""
+    """Search a keyframe in one submap; the result is a loop only if it is ``alone``."""
     found = foremost([one for one in judged(frame, candidate, settings) if passed(one, settings)], settings)
     if found is None or not found.alone:
         return found
@@ -166,7 +176,7 @@ def look_in(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> Fo
 
 
 def judged(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> list[Found]:
-    """All places of a submap that a matcher takes the keyframe to, with what is known about each: not yet loops."""
+    """All matches of the keyframe in a submap, with their figures; none is a loop yet."""
     sigma = candidate.submap.sigma
     points = points_of_frame(frame, sigma)
     if len(points.xy) < MatchSettings().min_points or len(candidate.submap.elements) < MatchSettings().min_points:
@@ -182,13 +192,13 @@ def judged(frame: Keyframe, candidate: Candidate, settings: LoopSettings) -> lis
 
 
 def unsure(P: Array, settings: LoopSettings) -> bool:
-    """Whether a guess is too vague for the matcher alone."""
+    """Whether an expected pose is too uncertain for the matcher without a wide search."""
     deviation = np.sqrt(np.diag(P))
     return bool(np.hypot(*deviation[:2]) > settings.sure_m or deviation[2] > settings.sure_rad)
 
 
 def foremost(fit: list[Found], settings: LoopSettings) -> Found | None:
-    """The best of several that passed; not ``alone`` where another is a different place: which one cannot be told."""
+    """The best of several that passed; not ``alone`` where another one lies at a different position."""
     if not fit:
         return None
     found = max(fit, key=lambda one: one.share)
@@ -200,7 +210,7 @@ def foremost(fit: list[Found], settings: LoopSettings) -> Found | None:
 
 
 def judgement(view: View, local: LocalMap, result: MatchResult, candidate: Candidate, settings: LoopSettings) -> Found:
-    """What there is to say about a match."""
+    """Figures of a match."""
     T, told = result.T_odom_base, candidate.told
     against = contradicted(local, se2.compose(T, view.T_base_lidar), view.beams, view.noise_m)
     extra = np.diag((settings.extra_m**2, settings.extra_m**2, settings.extra_rad**2))
@@ -221,13 +231,13 @@ def judgement(view: View, local: LocalMap, result: MatchResult, candidate: Candi
 
 
 def distance(T_from: Array, T_to: Array, P: Array) -> float:
-    """Squared Mahalanobis distance of two places, ``P`` in the axes that both are given in."""
+    """Squared Mahalanobis distance of two poses, ``P`` in the axes of both."""
     off = se2.rotation(T_from[2]) @ se2.between(T_from, T_to)
     return float(off @ invert3(P) @ off)
 
 
 def passed(found: Found, settings: LoopSettings) -> bool:
-    """Whether a judgement makes a loop."""
+    """Whether a match passes all conditions of a loop."""
     verdict = {
         Condition.IDS: found.shared >= settings.shared,
         Condition.LIGHT: found.light is None or found.light <= settings.light,
@@ -241,13 +251,13 @@ def passed(found: Found, settings: LoopSettings) -> bool:
 
 
 def told_by_light(frame: Keyframe, submap: Submap, settings: LoopSettings) -> Told | None:
-    """Step 2 of Sect. 4.3: None where too few links are clear, which leaves the registration to the laser."""
+    """Step 2 of Sect. 4.3: relative pose by light; None where too few links are clear."""
     virtual = frame.virtual
     if virtual is None or submap.light is None or len(virtual.accepted) < max(1, settings.links):
         return None
     T_map_submap, P_submap = submap.light
     T = se2.between(T_map_submap, virtual.T_map_base)
-    # an error of the submap's heading moves the keyframe sideways, seen from the submap
+    # an error of the submap's heading moves the keyframe sideways in the submap's frame
     R = se2.rotation(-T_map_submap[2])
     lever = np.array(((1.0, 0.0, -T[1]), (0.0, 1.0, T[0]), (0.0, 0.0, 1.0)))
     P = R @ virtual.covariance @ R.T + lever @ R @ P_submap @ R.T @ lever.T
@@ -256,7 +266,7 @@ def told_by_light(frame: Keyframe, submap: Submap, settings: LoopSettings) -> To
 
 
 def wide(frame: Keyframe, points: Array, candidate: Candidate, settings: LoopSettings) -> list[Array]:
-    """The places within three deviations where a scan fits best."""
+    """The positions within three sigma where a scan fits best."""
     deviation = 3.0 * np.sqrt(np.diag(candidate.P))
     at = se2.compose(candidate.T_submap_keyframe, frame.T_base_lidar)
     reach = min(float(deviation[:2].max()), settings.most_m), min(float(deviation[2]), np.pi)

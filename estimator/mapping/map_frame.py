@@ -1,10 +1,11 @@
-"""The map frame: corrections of it, and how surely it lies in the light survey's frame.
+"""The map frame: corrections of T_map_odom together with the submaps, and the covariance of the map in the survey.
 
-A correction moves the robot by ``T_map_odom`` and what was laid since by the same; :func:`apply_correction` does both.
+A correction moves the robot by ``T_map_odom`` and the submaps created since by the same transform;
+:func:`apply_correction` does both.
 
-What the pose knew when a map was left says much of that place and little of one far away: a heading that is sure to
-2 deg swings by half a metre over 15 m. But light has given the place of nearly every submap, and the pose graph has
-weighed all that. So the map as a whole lies as surely as all of them together say, each carried here.
+The last pose of a run determines the map near it, but not far away: a heading sigma of 2 deg means half a metre over 15
+m. But light has given the position of nearly every submap, and the pose graph has combined them. So the covariance of
+the whole map combines them all, each propagated to the present position.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3, swing
 
 APART: Final = 4.0
-"""By how much the variance of what light said is raised: its errors hang together over several submaps."""
+"""Inflation of the variance of light at a submap: its errors are correlated over several submaps."""
 
 BENT: Final = np.diag((0.1**2, 0.1**2, 0.02**2))
-"""What a map may be off at one place while it lies well as a whole: what the pose graph leaves of bends."""
+"""Local deformation of a map that is aligned as a whole (m, m, rad): what the pose graph leaves."""
 
 
 def apply_correction(map_: MapState, pose: MapPose, T_map_odom: Array, since: int, T_odom_base: Array) -> None:
-    """Correct the map frame: move the robot to ``T_map_odom``, and with it what was laid from keyframe ``since`` on."""
+    """Correct the map frame: move the robot to ``T_map_odom``, and the map from keyframe ``since`` on with it."""
     shift_map(map_, se2.compose(T_map_odom, se2.inverse(pose.T_map_odom)), since)
     pose.move(T_map_odom, T_odom_base)
 
 
 def shift_map(map_: MapState, moved: Array, since: int) -> None:
-    """Move the submaps that begin with keyframe ``since`` or later, 0 being the start, as one piece; and the newest."""
+    """Move the submaps that begin with keyframe ``since`` or later (0: the start) as one body, and the newest one."""
     parts = map_.parts
-    if since in (0, parts.session_start):  # all that was laid since the start
+    if since in (0, parts.session_start):  # everything created since the start
         map_.T_map_start = se2.compose(moved, map_.T_map_start)
     for anchor in reversed(map_.light_anchors.values()):
         if anchor.first < since:
@@ -52,13 +53,13 @@ def shift_map(map_: MapState, moved: Array, since: int) -> None:
 
 
 def unlist(map_: MapState, since: int) -> None:
-    """Take the keyframes from ``since`` on off the lists by place, and lists that are empty then."""
+    """Remove the keyframes from ``since`` on from the lists by position, and empty lists."""
     kept = {place: [key for key in keys if key < since] for place, keys in map_.places.items()}
     map_.places = {place: keys for place, keys in kept.items() if keys}
 
 
 def relist(map_: MapState, since: int) -> None:
-    """List the keyframes from ``since`` on, 0 being all, by the places that they have come to."""
+    """List the keyframes from ``since`` on (0: all) by their present positions."""
     unlist(map_, since)
     for key, frame in map_.keyframes.items():
         if key >= since:
@@ -68,15 +69,15 @@ def relist(map_: MapState, since: int) -> None:
 def alignment_covariance(
     submaps: Iterable[Submap], T_map_base: Array, first: int | None, left: tuple[Array, Array]
 ) -> Array:
-    """Covariance (m, m, rad; map axes) of the map in the survey's frame at a place of it.
+    """Covariance (m, m, rad; map axes) of the map in the survey frame at a position of it.
 
-    By light at the submaps or by what was known when the map was left, whichever is surer here.
+    It comes from light at the submaps or from the last pose of the earlier run, whichever is smaller here.
 
     Args:
         submaps: of the map.
-        T_map_base: the place.
+        T_map_base: the position.
         first: key of the first submap that is no part of that map, if there is one.
-        left: the pose when the map was left, and its covariance in the survey's frame (3, 3) then.
+        left: last pose of the earlier run, and its covariance in the survey frame (3, 3) then.
     """
     off, P_left = T_map_base - left[0], left[1].copy()
     swing(float(off[0]), float(off[1]), P_left)
@@ -88,7 +89,7 @@ def alignment_covariance(
 
 
 def as_a_whole(lit: list[Submap], T_map_base: Array) -> Array:
-    """Covariance by light at each of these submaps, carried to a place; wider where map and light disagree."""
+    """Combined covariance by light at these submaps, propagated to a position; wider where map and light disagree."""
     told = [one.light for one in lit if one.light is not None]
     P = APART * np.array([P for _, P in told])
     at = np.array([one.T_map_submap for one in lit])

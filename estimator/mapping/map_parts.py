@@ -1,4 +1,4 @@
-"""Which part of the submap graph is what: restored, detached, on trial, or set aside."""
+"""Parts of the submap graph: restored from a stored map, detached, on trial after relocalisation, or unaligned."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from estimator.numerics.arrays import Array
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Trial:
-    """Submaps laid since the robot was found in the map, while that place is being confirmed.
+    """Submaps created since the robot was found in the map, until that pose is confirmed.
 
     Attributes:
-        first: key of the first submap that is no part of the map the robot was found in. since: ID of the first
-            keyframe of that part. alone: the laser alone has decided. foreign_m: way driven when a map in a frame of
-            its own began to be searched, m; None: the map lies in the survey's frame, or there is no light.
+        first: key of the first submap that is no part of the map in which the robot was found.
+        since: ID of the first keyframe of that part.
+        alone: whether the lidar alone has decided.
+        foreign_m: path length at which the search in a map with its own frame began, m. None: the map lies in the
+            survey frame, or there is no light.
     """
 
     first: int
@@ -27,12 +29,15 @@ class Trial:
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class SetAside:
-    """A stored map in a frame of its own in which the robot has not been found yet.
+    """An unaligned map: a stored map with its own frame, in which the robot has not been found yet.
 
     Attributes:
-        submaps, constraints: as of `SubmapGraph`. frames: its keyframes by ID. session_start: as of `MapParts`, for
-            when it is found. first: key of the first submap that is no part of it; since: ID of the first such
-            keyframe. begun_m: way driven when it was first set aside, m.
+        submaps, constraints: as of `SubmapGraph`.
+        frames: its keyframes by ID.
+        session_start: as of `MapParts`, for when the robot is found.
+        first: key of the first submap that is no part of it.
+        since: ID of the first such keyframe.
+        begun_m: path length at which it first became unaligned, m.
     """
 
     submaps: dict[int, Submap]
@@ -49,13 +54,15 @@ class MapParts:
     """The parts that the submaps belong to.
 
     Attributes:
-        detached: key of the first submap whose place in the map is not known, None where the robot's place is: it and
-            all later ones are a part of the graph that nothing joins to the older one. detached_since: ID of their
-            first keyframe, 0 where nothing is detached. bridge: the way across that break, if there was one: key of
-            the submap before, T_submap_detached and its covariance in the latter's axes.
-        session_start: ID of this session's first keyframe where the map is a restored one, else 0. fixed: that map is
-            only used, see `MappingSettings.localise`.
-        trial: None: no place is being confirmed. aside: None: no map is set aside.
+        detached: key of the first submap of unknown pose in the map, None where the robot's pose is known. No edge
+            joins it and all later ones to the older graph.
+        detached_since: ID of their first keyframe, 0 where nothing is detached.
+        bridge: odometry across that break, if there was any: key of the submap before, T_submap_detached and its
+            covariance in the latter's axes.
+        session_start: ID of this session's first keyframe where the map is a restored one, else 0.
+        fixed: whether that map is only used, see `MappingSettings.localise`.
+        trial: None: no pose is being confirmed.
+        aside: None: there is no unaligned map.
     """
 
     detached: int | None = None
@@ -68,7 +75,7 @@ class MapParts:
 
     @property
     def unproved(self) -> int | None:
-        """Key of the first submap that is no part of the stored map, while that is undecided; None: it is decided."""
+        """Key of the first submap outside the stored map while that is undecided; None: it is decided."""
         if self.aside is not None:
             return self.aside.first
         if self.trial is not None and self.trial.foreign_m is not None:
@@ -76,5 +83,5 @@ class MapParts:
         return self.detached
 
     def attach(self) -> None:
-        """The robot's place is known: nothing is detached."""
+        """End the detachment, when the robot's pose is known."""
         self.detached, self.detached_since = None, 0

@@ -1,7 +1,7 @@
-"""A map at rest: everything of a map that outlives the process.
+"""Map snapshot for storage: submaps, edges, keyframes, learned lamp gains and the last pose.
 
-Taking it from a state and making a state with it is in `estimator.stored_map`. Whatever takes longer than a fraction
-of a millisecond (:meth:`MapImage.keyframes`, :func:`finished`) is for the thread that writes it.
+`estimator.stored_map` creates it from a state and a state from it. Operations longer than a fraction of a millisecond
+(:meth:`MapImage.keyframes`, :func:`finished`) belong into the thread that writes it.
 """
 
 from __future__ import annotations
@@ -19,20 +19,22 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 
 NOISE_M: Final = 0.01
-"""Range noise of submaps that are finished before any residual has told it."""
+"""Range noise of submaps that are finished before any residual is available, m."""
 
 Gains = Mapping[int, tuple[Array, Array]]
-"""By lamp ID: means and variances of (ln gain, lean x, lean y)."""
+"""By lamp ID: means and variances of (ln gain, tilt x, tilt y)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What tells one map from another.
+    """Identity of a map.
 
     Attributes:
-        map_id: of its frame, drawn once; 0: none. name: of floor or building, free text.
-        surveyed: its frame is the light survey's. survey: digest of that survey, empty without one.
-        session: how many runs have gone into it.
+        map_id: of its frame, drawn once; 0: none.
+        name: of storey or building, free text.
+        surveyed: whether its frame is the survey frame.
+        survey: digest of that survey, empty without one.
+        session: number of runs that have contributed.
     """
 
     map_id: int = 0
@@ -43,7 +45,7 @@ class Identity:
 
 
 class Piece(NamedTuple):
-    """A submap as it was at that moment; fields as of `Submap`."""
+    """A submap at the instant of the snapshot; fields as of `Submap`."""
 
     key: int
     first: int
@@ -55,7 +57,7 @@ class Piece(NamedTuple):
 
 
 class Hung(NamedTuple):
-    """A keyframe, the key of the submap in the image that it hangs on, and its place there."""
+    """A keyframe, the key of its submap in the image, and its pose there."""
 
     frame: Keyframe
     submap: int
@@ -64,16 +66,19 @@ class Hung(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapImage:
-    """A map at rest.
+    """A map for storage.
 
     Attributes:
-        identity: which one. submaps: settled, oldest first. constraints: between them.
-        frames: keyframes; where each lies is told by :meth:`keyframes`. hung: by key of a submap that another has taken
-            the place of: the other's key and T_other_submap.
-        unsettled: submaps whose content is not settled yet; see :func:`finished`. noise_m: range noise of theirs.
-        gains, sensors: learned of the lamps, and means and variances of the `lights` filter's states 6 to 14
-        (state_vector.py),
-            empty where nothing was. lamps: known then, from the survey or by their own word.
+        identity: see `Identity`.
+        submaps: finished ones, oldest first.
+        constraints: edges between them.
+        frames: keyframes; :meth:`keyframes` gives their poses.
+        hung: by key of a submap that another has replaced: the other's key and T_other_submap.
+        unsettled: submaps whose content is not finished yet; see :func:`finished`.
+        noise_m: range noise of theirs.
+        gains: learned gains of the lamps, empty without any.
+        sensors: means and variances of the light filter's states 6 to 14 (state_vector.py), None without any.
+        lamps: lamps known then, from the survey or from their own data.
         T_map_base, P: the last pose, with its covariance (map axes).
     """
 
@@ -91,7 +96,7 @@ class MapImage:
     P: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def keyframes(self) -> Iterator[Hung]:
-        """Keyframes whose submap is in the image, with their places."""
+        """Keyframes whose submap is in the image, with their poses."""
         keys = {piece.key for piece in self.submaps}
         for frame in self.frames:
             key = frame.submap.key
@@ -104,9 +109,9 @@ class MapImage:
 
 
 def finished(image: MapImage) -> MapImage:
-    """The image with its unsettled submaps settled by what hangs on them, and only constraints between what is there.
+    """The image with all submaps finished from their keyframes, and only edges between existing submaps.
 
-    Takes some milliseconds for each of them, which is for another thread.
+    It takes some milliseconds for each of them, and so belongs into another thread.
     """
     more = []
     for piece in image.unsettled:

@@ -1,4 +1,4 @@
-"""The map that the robot builds: keyframes, submap graph, live grid, and the settings of mapping."""
+"""Map state and mapping settings: keyframes, submap graph and live grid."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from estimator.numerics.arrays import Array
 
 @dataclass(frozen=True, slots=True)
 class MappingSettings:
-    """When keyframes are laid, which are kept, and when a loop is one.
+    """When keyframes are created, which are kept, and when a loop is accepted.
 
     Attributes:
-        keyframe_m, keyframe_rad: a keyframe is laid after this much motion, or where fewer than ``keyframe_share`` of
-            the beams still fit the map.
-        keep: passes of one place, 0.4 m and 45 deg around, whose keyframes are kept.
-        history: keep the pose of keyframes whose scan has been dropped; for replay, which needs them once at the end.
-        localise: a restored map is only used: it never moves, and what is laid on top of it is dropped soon.
-        live_m: metres per cell of a map that is kept up to date for display; 0: none is.
-        loops: when a place counts as seen before; None: never.
+        keyframe_m, keyframe_rad: distance and rotation between keyframes.
+        keyframe_share: inlier share below which a keyframe is created earlier.
+        keep: number of passes of one position, 0.4 m and 45 deg around, whose keyframes are kept.
+        history: keep the pose of keyframes whose scan has been dropped; a replay needs them once at the end.
+        localise: a restored map is only used: it never moves, and submaps on top of it are dropped soon.
+        live_m: metres per cell of the live grid for display; 0: there is none.
+        loops: settings of loop closure; None: no loops.
     """
 
     keyframe_m: float = 0.25
@@ -42,12 +42,16 @@ class MapState:
     """The map.
 
     Attributes:
-        settings: of mapping. graph: submaps, constraints between them, and their parts.
-        keyframes: by ID, with their scans. places: their IDs by half metre square and eighth of a turn.
-        retired: where history is kept, the submaps that dropped keyframes hang on, and their places there.
-        light_anchors: where light alone held the pose, by ID.
-        live: the map as cells, None: nobody asks for it. T_map_start: keyframe 0, where the robot was switched on.
-        next_key: ID of the next keyframe. newest_step: `MatchMemory.steps`, rounded down, at the newest keyframe.
+        settings: of mapping.
+        graph: submaps, edges between them, and their parts.
+        keyframes: by ID, with their scans.
+        places: their IDs by half metre square and eighth of a turn.
+        retired: where history is kept, the submaps of dropped keyframes, and their poses there.
+        light_anchors: anchors where light alone gave the pose, by ID.
+        live: the map as cells, None without a display.
+        T_map_start: keyframe 0, the pose at the start.
+        next_key: ID of the next keyframe.
+        newest_step: `MatchMemory.steps`, rounded down, at the newest keyframe.
     """
 
     settings: MappingSettings
@@ -63,11 +67,11 @@ class MapState:
 
     @property
     def parts(self) -> MapParts:
-        """Which part of the graph is what."""
+        """Parts of the graph."""
         return self.graph.parts
 
     def clear(self) -> None:
-        """Forget the map and all jobs about it."""
+        """Clear the map and all jobs about it."""
         self.keyframes, self.places, self.retired, self.light_anchors = {}, {}, {}, {}
         self.graph = self.graph.renewed()
         if self.live is not None:

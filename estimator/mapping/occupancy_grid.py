@@ -1,7 +1,6 @@
 """Occupancy grid: log-odds of every cell, by casting each beam through it.
 
-Beams are three-valued: a hit ends on a surface, a free beam clears up to its bound, and a beam that states nothing
-changes nothing.
+Beams have three values: a hit ends on a surface, a free beam clears its whole length, and any other changes nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ Placed = tuple[Array, Beams]
 """T_map_lidar and beams of a scan."""
 
 LIMIT = 50_000_000
-"""Cells beyond which a grid is refused: 200 MB."""
+"""Most cells of a grid: 200 MB."""
 
 HIT_LOGIT = 0.85
 FREE_LOGIT = -0.4
@@ -32,7 +31,8 @@ class Grid:
     """A map as cells.
 
     Attributes:
-        origin: (x, y) of the lower left corner of cell [0, 0], metres in the map frame. resolution: metres per cell.
+        origin: (x, y) of the lower left corner of cell [0, 0], metres in the map frame.
+        resolution: metres per cell.
         log_odds: float32 (rows, columns); row 0 has the smallest y; 0 is unknown, positive is occupied.
     """
 
@@ -42,7 +42,7 @@ class Grid:
 
     @property
     def probability(self) -> npt.NDArray[np.float32]:
-        """Probability that each cell is occupied; 0.5 where nothing is known."""
+        """Probability that each cell is occupied; 0.5 where it is unknown."""
         return np.asarray(1.0 / (1.0 + np.exp(-self.log_odds)), dtype=np.float32)
 
 
@@ -53,7 +53,7 @@ def cast_beams(
     T_map_lidar: Array,
     beams: tuple[Array, Array, npt.NDArray[np.uint8]],
 ) -> None:
-    """Add one scan to ``cells``; ``frame`` is the grid's (x, y, resolution). Walks each beam cell by cell."""
+    """Add one scan to ``cells``, walking each beam cell by cell; ``frame`` is the grid's (x, y, resolution)."""
     bearing, distance, kind = beams
     rows, columns = cells.shape
     ox = (T_map_lidar[0] - frame[0]) / frame[2]
@@ -85,7 +85,7 @@ def cast_beams(
 
 
 def extent(scans: Sequence[Placed], margin: float) -> tuple[Array, Array]:
-    """Lower left and upper right corner that hold every lidar and every surface point."""
+    """Lower left and upper right corner that contain every lidar and every surface point."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for T, (bearing, reach, kind) in scans:
         hit = (kind == Beam.HIT) & np.isfinite(reach) & np.isfinite(bearing)
@@ -97,7 +97,7 @@ def extent(scans: Sequence[Placed], margin: float) -> tuple[Array, Array]:
 
 
 def blank(rows: int, columns: int, resolution: float) -> npt.NDArray[np.float32]:
-    """So many unknown cells.
+    """Unknown cells of this size.
 
     Raises:
         ValueError: more than :data:`LIMIT`.

@@ -1,13 +1,13 @@
-"""Sparse Gauss-Newton over a graph of planar poses: relative constraints, absolute ones, and loops that may be false.
+"""Robust pose graph optimisation: sparse Gauss-Newton over planar poses, with loops that may be false.
 
-Minimises ``sum e^T H e`` with ``e = T_z^-1 (T_i^-1 T_j)`` for a constraint ``T_z`` between poses i and j, and
-``e = T_z^-1 T_i`` for an absolute one. A constraint that may be false counts by Geman-McClure's cost. There are two
-ways down to its least value; where the first leaves a constraint disbelieved both are gone, and the lower end counts:
+Minimises ``sum e^T H e`` with ``e = T_z^-1 (T_i^-1 T_j)`` for an edge ``T_z`` between poses i and j, and ``e = T_z^-1
+T_i`` for an absolute prior. An edge that may be false counts by Geman-McClure's cost. There are two descents to its
+minimum. Where the first leaves an edge rejected, the second runs too, and the lower minimum counts:
 
-* From the scale that noise explains: what agrees with the way just driven is believed, makes the graph surer, and so
-  brings in what agrees with that. Many false constraints never get a say; but a true one after much drift neither.
-* From a scale wide enough to believe every constraint, narrowed step by step (graduated non-convexity: Yang, Antonante,
-  Tzoumas, Carlone, RA-L 5(2), 2020): drift does no harm, but a third of false ones may bend the graph for good.
+* From the scale that noise explains: edges that agree with odometry are accepted first, reduce the covariance, and so
+  bring in further ones. Many false edges never get any weight. Neither does a true one after much drift.
+* From a scale wide enough to accept every edge, narrowed step by step (graduated non-convexity: Yang, Antonante,
+  Tzoumas, Carlone, RA-L 5(2), 2020). Drift does no harm, but a third of false edges may deform the graph for good.
 
 Steps that do not descend are damped (Levenberg-Marquardt).
 """
@@ -28,13 +28,17 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(slots=True, eq=False)
 class Graph:
-    """Poses and what is known of them; arrays have one row per pose, constraint or absolute constraint.
+    """Poses with their edges and absolute priors; arrays have one row per pose, edge or prior.
 
     Attributes:
         poses: (n, 3) x, y, yaw: the start.
-        edges: (m, 2) poses i, j. between: (m, 3) T_i_j. information: (m, 6), upper triangle by rows. doubtful: (m,)
-            whether the constraint may be false.
-        anchored: (p,) poses known absolutely. at: (p, 3). certainty: (p, 6); these may always be false.
+        edges: (m, 2) poses i, j.
+        between: (m, 3) T_i_j.
+        information: (m, 6), upper triangle by rows.
+        doubtful: (m,) whether the edge may be false.
+        anchored: (p,) poses with an absolute prior.
+        at: (p, 3) its pose.
+        certainty: (p, 6) its information; priors may always be false.
         held: (n,) poses that never move; empty: none.
     """
 
@@ -51,16 +55,17 @@ class Graph:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """What optimisation has made of a graph.
+    """Result of the optimisation.
 
     Attributes:
-        poses: (n, 3). chi2: of all constraints as weighted. iterations: of Gauss-Newton, both ways.
+        poses: (n, 3).
+        chi2: of all edges as weighted.
+        iterations: of Gauss-Newton, in both descents.
         converged: not stopped by the cap.
-        trust: (m,) weight of each constraint, 1 where it is not doubted, near 0 where it was voted out.
-        parts: number of parts of the graph that no constraint joins; each keeps its first pose unless one of its poses
-            is held or anchored.
-        covariance: (3, 3) of the pose that was asked for, in the map's axes: its own, all the others let go. Zeros for
-            one that is held, or if none was asked for.
+        trust: (m,) weight of each edge, 1 where it is not doubtful, near 0 where it is rejected.
+        parts: number of connected components; each keeps its first pose unless one of its poses is held or has a prior.
+        covariance: (3, 3) marginal covariance of the requested pose, in the map's axes. Zeros for a held pose, or
+            without a request.
     """
 
     poses: Array
@@ -79,10 +84,10 @@ def optimise(
 
     Args:
         graph: is not changed.
-        most: cap on iterations, of each way down.
+        most: cap on iterations, of each descent.
         settled: relative decrease of chi2 that ends them.
-        phi: chi2 of three degrees of freedom at which a doubtful constraint keeps a quarter of its weight.
-        covariance_of: pose whose covariance is wanted, -1 for none.
+        phi: chi2 of three degrees of freedom at which a doubtful edge keeps a quarter of its weight.
+        covariance_of: pose whose covariance is requested, -1 for none.
 
     Raises:
         ValueError: indices out of range, or numbers that are not finite.
@@ -120,10 +125,10 @@ def optimise(
 
 
 def check(graph: Graph) -> None:
-    """Refuse what is no graph.
+    """Validate a graph.
 
     Raises:
-        ValueError: naming what is wrong.
+        ValueError: with the name of the invalid array.
     """
     n = len(graph.poses)
     for name, index in (("edges", graph.edges), ("anchored", graph.anchored)):

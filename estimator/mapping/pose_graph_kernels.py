@@ -1,4 +1,4 @@
-"""Kernels of the pose graph: residuals, robust costs, normal equations, and the descent."""
+"""Kernels of the pose graph: residuals, robust costs, normal equations, descent and marginal covariance."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from estimator.numerics.elimination_ordering import NONE
 from estimator.numerics.jit import kernel
 
 NARROWER = 0.5
-"""By how much the scale of doubt narrows with every step."""
+"""Factor on the robust scale per step."""
 
 
 @kernel("i8[::1](i8, i8[:, ::1])", aside=True)
 def parts_of(n: int, edges: Ints) -> Ints:
-    """For each pose the lowest number among those it is joined with."""
+    """For each pose the lowest number in its connected component."""
     root = np.arange(n)
     for k in range(len(edges)):
         a, b = edges[k, 0], edges[k, 1]
@@ -40,7 +40,7 @@ def parts_of(n: int, edges: Ints) -> Ints:
 
 @kernel("f8(f8)", inner=True)
 def wrapped(angle: float) -> float:
-    """To (-pi, pi]."""
+    """Angle (rad) wrapped to (-pi, pi]."""
     return float(angle - 2.0 * np.pi * np.ceil((angle - np.pi) / (2.0 * np.pi)))
 
 
@@ -55,7 +55,7 @@ def quadratic(H: Array, e: Array, out: Array) -> float:
 
 @kernel("f8(f8, f8)", inner=True)
 def believed(chi2: float, phi: float) -> float:
-    """Weight of a doubtful constraint: the derivative of :func:`potential`."""
+    """Weight of a doubtful edge: the derivative of :func:`potential`."""
     s = phi / (phi + chi2)
     return s * s
 
@@ -68,7 +68,7 @@ def potential(chi2: float, phi: float) -> float:
 
 @kernel("void(f8[:, ::1], i8, i8, f8[:], f8[::1])", inner=True)
 def edge_error(poses: Array, i: int, j: int, z: Array, e: Array) -> None:
-    """``T_z^-1 (T_i^-1 T_j)``; with i = -1, T_i is the origin."""
+    """Write ``T_z^-1 (T_i^-1 T_j)`` to ``e``; with i = -1, T_i is the origin."""
     x = y = yaw = 0.0
     if i >= 0:
         x, y, yaw = poses[i, 0], poses[i, 1], poses[i, 2]
@@ -96,9 +96,9 @@ PATTERN = "Tuple((i8[::1], i8[::1], i8[::1], i8[::1]))"
 
 @kernel(f"f8(f8[:, ::1], {GIVEN}, {ABSOLUTE}, f8[::1], f8)", inner=True)
 def cost(poses: Array, given: Given, absolute: Absolute, trust: Array, phi: float) -> float:
-    """chi2 as weighted, and the ``trust`` in each edge.
+    """chi2 as weighted; writes the weight of each edge to ``trust``.
 
-    A doubtful constraint costs its potential, so that descent can be judged by it.
+    A doubtful edge counts by its potential, so that the descent can use it as its cost.
     """
     edges, between, information, doubtful = given
     total = 0.0
@@ -116,7 +116,7 @@ def cost(poses: Array, given: Given, absolute: Absolute, trust: Array, phi: floa
 
 @kernel(f"f8(f8[:, ::1], {GIVEN}, {ABSOLUTE})", aside=True)
 def worst(poses: Array, given: Given, absolute: Absolute) -> float:
-    """Largest chi2 of a constraint that may be false."""
+    """Largest chi2 of an edge or prior that may be false."""
     edges, between, information, doubtful = given
     e, He = np.empty(3), np.empty(3)
     largest = 0.0
@@ -158,7 +158,7 @@ def linearise(
     how: tuple[Array, Ints, float],
     system: tuple[Array, Array, Array],
 ) -> None:
-    """Normal equations in the order of elimination. ``how``: trust, block of each edge, phi."""
+    """Normal equations in the order of elimination. ``how``: weights, block of each edge, phi."""
     edges, between, information, _ = given
     place, _ = structure
     trust, slot, phi = how
@@ -203,7 +203,7 @@ def linearise(
 
 @kernel(f"i8[::1](i8[:, ::1], i8[::1], {PATTERN})", inner=True)
 def slots_of(edges: Ints, place: Ints, pattern: tuple[Ints, Ints, Ints, Ints]) -> Ints:
-    """Where in the pattern the block of each edge lies, -1 where one of its poses is held."""
+    """Index of each edge's block in the pattern, -1 where one of its poses is held."""
     start, down, _, _ = pattern
     slot = np.full(len(edges), -1)
     for k in range(len(edges)):
@@ -233,10 +233,11 @@ def descend(
     trust: Array,
     told: Array,
 ) -> tuple[float, int, bool]:
-    """Gauss-Newton steps, damped where they do not descend; moves ``poses``.
+    """Gauss-Newton steps, damped where they do not descend; changes ``poses``.
 
-    Each step is taken as it is and along the spanning tree, whichever descends farther. ``told``: most, settled, phi,
-    and the scale to begin with.
+    Each step is tried as it is and along the spanning tree; the one with the lower cost counts. ``told``: iteration
+    cap, convergence threshold, phi, and the initial scale. Returns the cost, the iterations and whether it has
+    converged.
     """
     place, pattern = structure
     n, nnz = len(pattern[0]) - 1, len(pattern[1])
@@ -295,7 +296,10 @@ def marginal(
     asked: tuple[Array, float, int],
     covariance: Array,
 ) -> bool:
-    """Covariance of one pose: its block of the inverse, column by column. ``asked``: trust, phi, place of the pose."""
+    """Covariance of one pose: its block of the inverse, column by column. ``asked``: weights, phi, index of the pose.
+
+    False where the normal equations are singular.
+    """
     trust, phi, which = asked
     place, pattern = structure
     n, nnz = len(pattern[0]) - 1, len(pattern[1])

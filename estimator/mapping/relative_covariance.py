@@ -1,9 +1,9 @@
-"""How surely two submaps' places are known relative to each other: by the surest single path that joins them.
+"""Upper bound on the relative covariance of two submaps: the minimum-trace path through the pose graph (Dijkstra).
 
-The graph's own marginals are relative to its start: a robot that has just closed a loop far from there is sure of what
-is around it and not of where that lies as seen from the start. Covariances of relative poses add up along a path once
-each is carried to one place (the carry is linear: `se2.carry`), so the surest path to every submap is Dijkstra's. That
-ignores all other paths and so is a bound from above.
+The graph's own marginals are relative to its start. After a loop closure far from there, the robot's surroundings
+are known, but not their position relative to the start. Covariances of relative poses add up along a path once each is
+propagated to one position. That propagation is linear (`se2.carry`), so Dijkstra finds the path with the smallest trace
+to every submap. All other paths are ignored, so the result is an upper bound.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.jit import kernel
 
 BELIEVED: Final = 0.25
-"""A loop that the graph believes less than this joins nothing."""
+"""Smallest weight of a loop that can be part of a path."""
 
 UNTIED: Final = 1e4
-"""Variance (m^2, rad^2) of what nothing joins."""
+"""Variance (m^2, rad^2) of a submap without a path."""
 
 
 def tied(graph: Graph, poses: Array, trust: Array, to: int) -> Array:
-    """(n, 3, 3) covariance, map axes, of pose ``to`` relative to each of ``poses``; ``trust`` in each constraint."""
+    """(n, 3, 3) covariance, map axes, of pose ``to`` relative to each of ``poses``; ``trust``: weight of each edge."""
     used = np.flatnonzero(trust > BELIEVED)
     edges = np.ascontiguousarray(graph.edges[used])
     carried = carried_to(poses[to], poses[edges[:, 1]], graph.information[used])
@@ -35,7 +35,7 @@ def tied(graph: Graph, poses: Array, trust: Array, to: int) -> Array:
 
 
 def carried_to(there: Array, at: Array, information: Array) -> Array:
-    """(m, 3, 3) covariances, map axes, that constraints which end at poses ``at`` (m, 3) mean for a place ``there``."""
+    """(m, 3, 3) covariances, map axes, of edges that end at poses ``at`` (m, 3), propagated to the pose ``there``."""
     H = information[:, (0, 1, 2, 1, 3, 4, 2, 4, 5)].reshape(-1, 3, 3)
     P = inverse3(H)
     c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
@@ -46,14 +46,14 @@ def carried_to(there: Array, at: Array, information: Array) -> Array:
 
 
 def inverse3(H: Array) -> Array:
-    """Of (m, 3, 3) symmetric matrices, by their adjugates."""
+    """Inverses of (m, 3, 3) symmetric matrices, by their adjugates."""
     a, b, c = H[:, 0], H[:, 1], H[:, 2]
     adjugate = np.stack((np.cross(b, c), np.cross(c, a), np.cross(a, b)), axis=2)
     return np.asarray(adjugate / np.einsum("ij,ij->i", a, adjugate[:, :, 0])[:, None, None])
 
 
 def rows_of(n: int, edges: Ints) -> tuple[Ints, Ints]:
-    """For each pose where its constraints begin, and the constraints, in compressed rows."""
+    """For each pose the start of its edges, and the edges, in compressed rows."""
     ends = edges.T.ravel()
     order = np.argsort(ends, kind="stable")
     start = np.searchsorted(ends[order], np.arange(n + 1))
@@ -62,7 +62,7 @@ def rows_of(n: int, edges: Ints) -> tuple[Ints, Ints]:
 
 @kernel("void(i8, i8[:, ::1], f8[:, :, ::1], UniTuple(i8[::1], 2), f8[:, :, ::1])", aside=True)
 def surest(to: int, edges: Ints, carried: Array, rows: tuple[Ints, Ints], out: Array) -> None:
-    """Dijkstra from ``to``, a path being as long as the trace of its covariance; ``out`` gets the covariances."""
+    """Dijkstra from ``to`` with the trace of the covariance as path length; writes the covariances to ``out``."""
     start, order = rows
     n = len(out)
     far, done = np.full(n, np.inf), np.zeros(n, np.bool_)

@@ -1,10 +1,10 @@
-"""A step of the graph's optimisation, taken in relative coordinates along a spanning tree.
+"""Gauss-Newton step of the pose graph in relative coordinates along a spanning tree.
 
-The normal equations answer with a small move of each pose in the map's axes. Added to the poses it tears what a long
-chain has turned by much: the same turn moves far poses along a straight line where they should go round a circle. Taken
-instead as a change of each pose as seen from the one before in the tree, the constraints of the tree get exactly the
-error that the equations have foretold, and only loops meet the curvature (cf. Olson, Leonard, Teller, ICRA 2006;
-Grisetti et al., RSS 2007, who optimise in such coordinates altogether).
+The normal equations give a small displacement of each pose in the map's axes. Added to the poses, it distorts a long
+chain that rotates by much: one rotation moves far poses along a straight line instead of a circle. Here the step
+changes each pose relative to its parent in the tree. Then the edges of the tree get exactly the error that the
+equations predict. Only loops are affected by the curvature (cf. Olson, Leonard, Teller, ICRA 2006; Grisetti et al., RSS
+2007, who optimise in such coordinates altogether).
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from estimator.numerics.jit import kernel
 
 @kernel("Tuple((i8[::1], i8[::1]))(i8, i8[:, ::1], b1[::1], b1[::1])", aside=True)
 def spanning(n: int, edges: Ints, doubtful: Bools, free: Bools) -> tuple[Ints, Ints]:
-    """A tree over constraints that are not doubted: poses in order of distance from its roots, and each one's parent.
+    """Spanning tree over the edges that are not doubtful: poses by distance from its roots, and the parent of each.
 
-    Poses that are not free are roots, and the first of each part that has none; a root's parent is ``NONE``.
+    Poses that are not free are roots. So is the first pose of each component without one; a root's parent is ``NONE``.
     """
     sure = np.empty((len(edges), 2), np.int64)
     count = 0
@@ -55,7 +55,7 @@ def spanning(n: int, edges: Ints, doubtful: Bools, free: Bools) -> tuple[Ints, I
 
 @kernel("void(f8[:, ::1], f8[:, ::1], i8[::1], Tuple((i8[::1], i8[::1])), f8[:, ::1])", inner=True)
 def carry_on(poses: Array, step: Array, place: Ints, tree: tuple[Ints, Ints], out: Array) -> None:
-    """``out`` (n, 3) = ``poses`` after ``step`` (by ``place``, which is negative where a pose is held)."""
+    """Write ``poses`` after ``step`` to ``out`` (n, 3); ``step`` is indexed by ``place``, negative for a held pose."""
     order, parent = tree
     for at in range(len(order)):
         j = order[at]
@@ -63,7 +63,7 @@ def carry_on(poses: Array, step: Array, place: Ints, tree: tuple[Ints, Ints], ou
         dx = dy = turn = 0.0
         if row >= 0:
             dx, dy, turn = step[row, 0], step[row, 1], step[row, 2]
-        if i < 0:  # a root goes along an arc
+        if i < 0:  # a root moves along an arc
             half = 0.5 * turn
             chord = np.sin(half) / half if abs(half) > 1e-8 else 1.0
             c, s = chord * np.cos(half), chord * np.sin(half)

@@ -1,4 +1,4 @@
-"""The map as submaps and what joins them, with the covariances of their places."""
+"""The submap graph: submaps with their edges, and the covariances of their poses."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ from estimator.numerics.arrays import Array
 from estimator.result import Loop
 
 FLOOR: Final = np.diag((0.005**2, 0.005**2, math.radians(0.1) ** 2))
-"""What a keyframe's place loses against the one before, beyond what the matches know of: 5 mm and 0.1 deg."""
+"""Covariance that a keyframe's pose relative to the previous one has beyond that of the matches: 5 mm and 0.1 deg."""
 
 NEAR_M, NEAR_RAD, KEPT = 1.5, 0.25 * math.pi, 2
-"""So many submaps are kept that begin so near each other, with the robot looking the same way. In a grid of places they
-would go on filling up for hours, because no lap begins its submaps where the last one did."""
+"""Distance (m) and heading difference (rad) of submaps of one area, and how many of these are kept.
+
+A grid of positions would fill up for hours instead, because each lap begins its submaps at other positions.
+"""
 
 SOLUTION: Final = "solution of the graph"
-"""Owner of the job that solves it."""
+"""Owner of the job that solves the graph."""
 
 OWN: Final = 12
 """Submaps of this session kept on top of a restored map that is only used."""
@@ -34,10 +36,12 @@ OWN: Final = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Waiting:
-    """A loop that would move the pose far, until a second one agrees: the same stretch of the way, found again.
+    """A loop with a large correction, until a second one agrees: a match of the same segment of the path.
 
     Attributes:
-        T_found_odom: where the odom frame would lie, seen from the submap that was found.
+        found: the match.
+        frame: its keyframe.
+        T_found_odom: resulting pose of the odom frame in the matched submap.
     """
 
     found: Found
@@ -47,20 +51,28 @@ class Waiting:
 
 @dataclass(slots=True, eq=False)
 class SubmapGraph:
-    """Submaps and what joins them.
+    """Submaps and their edges.
 
     Attributes:
-        jobs: the estimator's queue. parts: which submaps are restored, detached, on trial or set aside.
-        submaps: by key, oldest first. frames: keyframes of the newest one. constraints: between them.
-        C: covariance (odom axes) of the newest keyframe's place relative to the newest submap's, T_odom_last its place.
-        marginal: covariance (odom axes) of the newest submap's place in the map.
-        strayed: covariance that the way has added since the start, about the odom frame's origin (see
+        jobs: the estimator's queue.
+        parts: which submaps are restored, detached, on trial or unaligned.
+        submaps: by key, oldest first.
+        frames: keyframes of the newest one.
+        constraints: edges between them.
+        C: covariance (odom axes) of the newest keyframe's pose relative to the newest submap's.
+        T_odom_last: pose of the newest keyframe.
+        marginal: covariance (odom axes) of the newest submap's pose in the map.
+        strayed: accumulated covariance of the path since the start, about the odom frame's origin (see
             :meth:`strayed_since`).
-        ties: covariance (odom axes) of submap ``tied``'s place relative to others, by key, as the graph has it.
-        way_m: driven between keyframes. since_look: keyframes since the last search for a loop.
-        waiting: loops without support.
-        stale: whether the graph has changed since it was solved. cut_at: ID of a keyframe that begins a submap, 0: any.
-        closures: loops accepted so far. news: the latest, until it was reported.
+        ties: relative covariance (odom axes) of submap ``tied`` and others, by key, from the graph.
+        tied: that submap.
+        way_m: path length between keyframes.
+        since_look: keyframes since the last search for a loop.
+        waiting: loops without consensus.
+        stale: whether the graph has changed since it was solved.
+        cut_at: ID of a keyframe that begins a submap, 0: any.
+        closures: number of loops accepted so far.
+        news: the latest, until it is reported.
     """
 
     jobs: JobQueue = field(default_factory=JobQueue)
@@ -84,11 +96,11 @@ class SubmapGraph:
 
     @property
     def newest(self) -> Submap | None:
-        """The submap being driven through."""
+        """The submap under construction."""
         return next(reversed(self.submaps.values()), None)
 
     def of_part(self, submap: Submap) -> list[Submap]:
-        """The submaps whose place relative to this one is known: all, or those that are (not) detached as it is."""
+        """The submaps with a known pose relative to this one: all, or those in the same part, detached or not."""
         first = self.parts.detached
         if first is None:
             return list(self.submaps.values())
@@ -96,7 +108,7 @@ class SubmapGraph:
         return [other for other in self.submaps.values() if (other.key >= first) == detached]
 
     def settled(self) -> list[Submap]:
-        """The submaps in which the place can be looked for: finished, and not detached."""
+        """The submaps for a search of the pose: finished, and not detached."""
         first = self.parts.detached
         return [
             submap
@@ -105,9 +117,9 @@ class SubmapGraph:
         ]
 
     def detach(self, since: int) -> None:
-        """Detach what is laid from keyframe ``since`` on, the next one: its place is not known. There must be a map.
+        """Detach what is created from keyframe ``since``, the next one, on: its pose is not known. There must be a map.
 
-        What was detached already, and has never been placed, is forgotten.
+        Submaps that were detached already, and never attached, are removed.
         """
         first = self.parts.detached
         if first is not None:
@@ -115,26 +127,26 @@ class SubmapGraph:
             self.constraints.keep(np.asarray(np.isin(self.constraints.between, kept).all(axis=1)))
             self.submaps = {key: self.submaps[key] for key in kept}
             self.frames = []
-        self.waiting = []  # no loop of another part can support them
+        self.waiting = []  # no loop of another part can confirm them
         newest = self.newest
         assert newest is not None
         self.parts.detached, self.parts.detached_since, self.parts.bridge = newest.key + 1, since, None
 
     def take_news(self) -> Loop | None:
-        """The latest loop, once."""
+        """The latest loop, returned once."""
         news, self.news = self.news, None
         return news
 
     def renewed(self) -> SubmapGraph:
-        """An empty one; answers to the jobs of this one are dropped."""
+        """An empty graph; results of the jobs of this one are dropped."""
         self.jobs.clear()
         return SubmapGraph(self.jobs, closures=self.closures)
 
     def add(self, frame: Keyframe, P: Array, sigma: float, anew: bool) -> None:
-        """Hang a keyframe, with its covariance relative to the one before (odom axes), on the newest submap.
+        """Add a keyframe, with its covariance relative to the previous one (odom axes), to the newest submap.
 
-        ``sigma``: range noise. ``anew``: the laser had lost its map before it, so that the two may lie anywhere in a
-        common submap: it begins its own.
+        ``sigma``: range noise. ``anew``: the local map was lost before it. The two keyframes may then lie anywhere
+        relative to each other, so it begins its own submap.
         """
         newest, T = self.newest, frame.T_odom_keyframe
         x, y, _ = (T - self.T_odom_last).tolist()
@@ -159,7 +171,7 @@ class SubmapGraph:
                 frame.submap.light = se2.compose(frame.virtual.T_map_base, T_keyframe_submap), P_map
 
     def _begin(self, frame: Keyframe, before: Submap | None, sigma: float) -> None:
-        """A new submap at this keyframe; the one before is settled."""
+        """Begin a new submap at this keyframe; the previous one is finished."""
         key = 1 if before is None else before.key + 1
         T = frame.T_odom_keyframe
         if before is not None:
@@ -178,7 +190,7 @@ class SubmapGraph:
         self.frames = []
 
     def spread(self, T_odom: Array) -> Array:
-        """Covariance (odom axes, of the map's oldest submap) of a place reached from the newest submap."""
+        """Covariance (odom axes, relative to the map's oldest submap) of a pose reached from the newest submap."""
         return self.reached(self.marginal, T_odom)
 
     def reached(self, P_newest: Array, T_odom: Array) -> Array:
@@ -189,22 +201,22 @@ class SubmapGraph:
         return np.asarray(F @ P_newest @ F.T + self.C)
 
     def loosen(self, P: Array, T_odom: Array) -> None:
-        """Add to what the way has lost, at a place: covariance ``P`` in odom axes."""
+        """Add covariance ``P`` (odom axes) at a pose to the accumulated covariance of the path."""
         self.C += P
         A = se2.lever_matrix(-T_odom)
         self.strayed = self.strayed + A @ P @ A.T
 
     def strayed_since(self, since: Submap, T_odom: Array) -> Array:
-        """Covariance (odom axes) of a place relative to a submap by the way between them alone: a bound from above.
+        """Upper bound on the covariance (odom axes) of a pose relative to a submap: that of the path between them.
 
-        Each step of the way adds its own, swung out by the lever from there to here; summed up about one origin, the
-        sums of two instants can be subtracted.
+        Each step of the path adds its own, transformed by the lever arm from there to here. Summed about one origin,
+        the sums of two instants can be subtracted.
         """
         A = se2.lever_matrix(T_odom)
         return np.asarray(A @ (self.strayed - since.strayed) @ A.T)
 
     def apart(self, other: Submap, T_odom: Array) -> Array:
-        """Covariance (odom axes) of a place relative to an earlier submap: by the way since, or by a loop since."""
+        """Covariance (odom axes) of a pose relative to an earlier submap: by the path since, or by a loop since."""
         way = self.strayed_since(other, T_odom)
         tie = self.ties.get(other.key)
         if tie is None or self.tied is None:
@@ -222,9 +234,9 @@ class SubmapGraph:
         self.jobs.ask(SETTLE, lambda: settle(frames, submap.T_odom_submap, sigma), then)
 
     def thin_out(self, latest: Submap) -> None:
-        """Bound what is kept per area: of the submaps of one place and heading the newest few stay."""
+        """Limit the stored data per area: of the submaps at one position and heading the newest few stay."""
         trial = self.parts.trial
-        first = 0 if trial is None else trial.first  # what is on trial takes the place of nothing older
+        first = 0 if trial is None else trial.first  # a submap on trial replaces no older one
         part = [other for other in self.of_part(latest) if (other.key < first) == (latest.key < first)]
         here = [other for other in part if alike(other, latest) and not self.is_held(other)]
         for submap in here[:-KEPT]:
@@ -236,11 +248,11 @@ class SubmapGraph:
                 self.drop(submap)
 
     def is_held(self, submap: Submap) -> bool:
-        """Whether a submap is one of a restored map that is only used."""
+        """Whether a submap belongs to a restored map that is only used."""
         return self.parts.fixed and submap.first < self.parts.session_start
 
     def drop(self, submap: Submap) -> None:
-        """Take a submap out of the graph; what hangs on it goes on hanging, on the neighbour that is surest of it."""
+        """Remove a submap from the graph; its keyframes refer to the neighbour of smallest relative covariance."""
         rows = handed_on(np.array(list(self.submaps)), self.constraints, submap.key)
         joined = [self.constraints.seen_from(submap.key, row) for row in rows]
         if not joined:
@@ -254,6 +266,6 @@ class SubmapGraph:
 
 
 def alike(one: Submap, other: Submap) -> bool:
-    """Whether two submaps begin in one place and look the same way."""
+    """Whether two submaps begin at one position with the same heading."""
     x, y, yaw = (one.T_map_submap - other.T_map_submap).tolist()
     return math.hypot(x, y) < NEAR_M and abs(se2.wrap(yaw)) < NEAR_RAD

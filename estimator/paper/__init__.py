@@ -1,9 +1,9 @@
-"""The paper's method as printed, and pIC, beside lumiloop's own: estimators that are run by name.
+"""The paper's method as printed, and pIC, beside the daemon's method: estimators that run by name.
 
     run = method("paper")(Settings(), lights)
     result = run.step(records, limits)
 
-Nothing is loaded before a method is asked for, and no daemon asks.
+The modules of the package load in :func:`method` only, which a running daemon never calls.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from estimator.state import Settings
 
 LUMILOOP: Final = "lumiloop"
-"""The method of the daemon."""
+"""Name of the daemon's method."""
 METHODS: Final = {
     LUMILOOP: "the method of the daemon",
     "paper": "the paper's method as printed",
     "pic": "probabilistic iterative correspondence, the paper's baseline, which knows no light",
 }
-"""Every method by name, with its description."""
+"""Description of every method by name."""
 
 
 class UnknownMethod(ValueError):
-    """There is no method of that name; the text lists those that there are."""
+    """There is no method of that name; the text lists the valid ones."""
 
 
 def method(name: str) -> Callable[[Settings, LightsSetup | None], Method]:
-    """The method called ``name``: call it with settings and the photodiode (None: there is none) to begin a run.
+    """Constructor of the method called ``name``; its arguments are settings and the photodiode (None: there is none).
 
     Raises:
         UnknownMethod: there is none of that name.

@@ -1,8 +1,8 @@
-"""Adaptive Link_n: which of the shortest links agree with each other, and how many of these to use.
+"""Adaptive Link_n: the consistent subset of the shortest links, and the number of them with the smallest error.
 
-A link whose straight way is blocked is weak, so it looks long: the shortest links are seldom wrong. From the first few
-of them a set is grown, link by link, as long as each next one is consistent with the place that the others give; then
-the number of links is the one whose expected error is least for the solver at hand.
+A link with a blocked line of sight is weak, so it looks long: the shortest links are seldom wrong. From the first few
+of them a set grows, link by link. Each next one has to be consistent with the position by the others. The number of
+links is then the one with the smallest expected error for the solver in use.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from estimator.paper.lateration_model import Links, SolverSettings, expected_err
 from estimator.paper.lateration_solvers import DECIDED, SAME_M, Solution, Strengths, distinct, starts
 
 SEEDS: Final = 5
-"""Triples of the so many shortest links are tried until one is consistent with all other links."""
+"""Number of shortest links whose triples are tried until one is consistent with all other links."""
 WEAKER: Final = 25.0
-"""A link weaker than the others let expect is blocked when it raises the least chi2 by more (5 sigma)."""
+"""Increase of the smallest chi2 by which a link weaker than expected counts as blocked (5 sigma)."""
 STRONGER: Final = 400.0
-"""One that is stronger has light from a near wall; it is wrong (moved, exchanged) only when it raises chi2 by more."""
+"""The same for a stronger link; light from a near wall adds to it, and only a moved or exchanged lamp exceeds this."""
 RIVALS: Final = 3
-"""Places that are carried along while they all fit."""
+"""Most positions kept while they all fit."""
 
 
 def adapted(links: Links, survey: Survey, settings: SolverSettings) -> list[int]:
-    """Which of ``links`` (shortest first) to use, in that order; all of them where there are fewer than four."""
+    """Indices in ``links`` (shortest first) to use, in that order; all of them where there are fewer than four."""
     if len(links.d) <= 3:
         return list(range(len(links.d)))
     agreeing, place = consistent(links, survey, settings)
@@ -44,7 +44,7 @@ def adapted(links: Links, survey: Survey, settings: SolverSettings) -> list[int]
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Links that agree, with the places they fit, best first; ``score``: chi2 and what leaving out the others costs."""
+    """Consistent links, with the positions that fit, best first; ``score``: chi2 and the cost of the excluded links."""
 
     links: list[int]
     places: list[Solution]
@@ -52,7 +52,7 @@ class Agreement:
 
 
 def consistent(links: Links, survey: Survey, settings: SolverSettings) -> tuple[list[int], Array | None]:
-    """The set of links that explains most, shortest first, and the place (x, y) it gives (None: no triple fits)."""
+    """The largest consistent set of links, shortest first, and its position (x, y); None if no triple fits."""
     best: Agreement | None = None
     for triple in combinations(range(min(SEEDS, len(links.d))), 3):
         if spread(links.pick(triple).xy)[0] < SAME_M:
@@ -60,7 +60,7 @@ def consistent(links: Links, survey: Survey, settings: SolverSettings) -> tuple[
         grown = _grown(links, survey, settings, list(triple))
         if grown is not None and (best is None or grown.score < best.score):
             best = grown
-        if best is not None and best.score < WEAKER:  # leaving out anything would cost more
+        if best is not None and best.score < WEAKER:  # excluding any link would cost more
             break
     if best is None:
         return list(range(len(links.d))), None
@@ -68,7 +68,7 @@ def consistent(links: Links, survey: Survey, settings: SolverSettings) -> tuple[
 
 
 def _grown(links: Links, survey: Survey, settings: SolverSettings, triple: list[int]) -> Agreement | None:
-    """A triple with every link that is consistent with it and with those taken before; None if it fits no place."""
+    """A triple with every link consistent with it and with those added before; None if it fits no position."""
     few = links.pick(triple)
     fit = Strengths(few, survey, settings)
     found = distinct([fit.descend(np.array((*s, 0.0, survey.floor))) for s in starts(few)], DECIDED)[:RIVALS]
@@ -88,7 +88,7 @@ def _grown(links: Links, survey: Survey, settings: SolverSettings, triple: list[
 
 
 def _stronger(links: Links, i: int, theta: Array) -> float:
-    """Logarithm of a link's strength over what a place lets expect, all levelled."""
+    """Logarithm of a link's RSS over the expected one at a position, all levelled."""
     d2 = float(np.sum((theta[:2] - links.xy[i]) ** 2)) + links.h[i] ** 2
     expected = (links.h[i] ** 2 / d2) ** (0.5 * links.exponent[i]) + theta[3]
     return float(-np.log(links.diffuse[i] * expected) - theta[2])

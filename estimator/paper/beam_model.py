@@ -1,14 +1,14 @@
-"""The beam model (Eq. 8-9): how probable a scan is at a pose, given the surfaces that are known.
+"""The beam sensor model (Eq. 8-9): probability of a scan at a pose, given the surfaces of the map.
 
-Each measured range is one of four things: the surface expected there (a Gaussian cut off at the sensor's limits),
-somebody in front of it (an exponential up to the surface), no echo at all (a lump of probability), or anything. Eq. 9
-multiplies the beams as if they were independent. They are not: a bent wall or a wrong heading moves hundreds of them
-together, so the product is tempered, ``p^(1/c)`` with one in ``c`` beams independent; ``c`` = number of beams is the
-mean per measurement that Eq. 15 needs.
+Each measured range is one of four things. It is the expected surface: a Gaussian cut off at the sensor's limits. Or it
+is an obstacle before it: an exponential up to the surface. Or there is no echo (a discrete probability), or any range.
+Eq. 9 multiplies the beams as if they were independent. They are not: a bent wall or a wrong heading shifts hundreds of
+them together. So the product is tempered, ``p^(1/c)`` with one in ``c`` beams independent. ``c`` = number of beams
+gives the mean per measurement that Eq. 15 needs.
 
-Expected ranges are cast, not taken from a likelihood field of distances to the nearest point: the field knows of no
-occlusion, and would count a scan that looks through a wall as a good one. Casting the surfaces as segments into the
-beams (a z-buffer over bearings) costs as much as one pass over the points.
+Expected ranges come from ray casting, not from a likelihood field of distances to the nearest point. Such a field
+ignores occlusion, and would rate a scan that sees through a wall as good. Casting the surfaces as segments (a z-buffer
+over bearings) costs as much as one pass over the points.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from estimator.numerics.jit import kernel
 
 ROOT_2PI = math.sqrt(2.0 * math.pi)
 GAP_M, GAP_SHARE = 0.15, 0.08
-"""Neighbouring points are one surface if they are no farther apart than the first and that share of their range."""
+"""Largest gap (m) between neighbouring points of one surface, and the additional limit as a share of their range."""
 
 EDGE_ON = 1e-12
-"""Sine below which a segment is seen edge on, or is a point: which end is met first is then a matter of rounding."""
+"""Sine below which a segment is seen edge on, or is a point; rounding then decides which end is nearer."""
 
 HIT, SHORT, MAX, RAND, SIGMA, DECAY, FAR = range(7)
 """Columns of a model's row."""
@@ -39,8 +39,9 @@ class BeamModel:
     """Mixture weights (any positive scale, normalised in :meth:`row`) and shapes of Eq. 9.
 
     Attributes:
-        hit, short, most, rand: the surface, something before it, no echo, anything.
-        sigma_m: of the hit, range noise of both the scan and the surface. decay: of the short ones, 1/m.
+        hit, short, most, rand: weights of the surface, an obstacle before it, no echo, any range.
+        sigma_m: sigma of the hit, range noise of both the scan and the surface.
+        decay: decay of the short ones, 1/m.
         far_m: longest range.
     """
 
@@ -53,7 +54,7 @@ class BeamModel:
     far_m: float = 30.0
 
     def row(self) -> Array:
-        """As the kernels take it, weights summing to one.
+        """The model as an array for the kernels; the weights sum to one.
 
         Raises:
             ValueError: a weight is negative, all are zero, or a shape is not positive.
@@ -69,8 +70,8 @@ class BeamModel:
 def density(z: float, expected: float, model: Array) -> float:
     """Probability density (1/m) of an echo from range ``z`` where a surface is expected at ``expected``.
 
-    Together with :func:`silence` it sums to one over all that a beam can say. A surface beyond the longest range gives
-    no echo.
+    Together with :func:`silence` it sums to one over all results of a beam. A surface beyond the longest range gives no
+    echo.
     """
     far = model[FAR]
     if not 0.0 <= z <= far:
@@ -89,7 +90,7 @@ def density(z: float, expected: float, model: Array) -> float:
 
 @kernel("f8(f8, f8[::1])", inner=True)
 def silence(expected: float, model: Array) -> float:
-    """Probability that a beam brings no echo."""
+    """Probability that a beam returns no echo."""
     return float(model[MAX] if expected < model[FAR] else model[MAX] + model[HIT])
 
 
@@ -97,9 +98,10 @@ def silence(expected: float, model: Array) -> float:
 def sum_log(
     beams: tuple[Array, Array, npt.NDArray[np.uint8]], expected: Array, model: Array, stride: int
 ) -> tuple[float, int]:
-    """Logarithm of Eq. 9 over every ``stride``-th beam that says something where a surface is expected; their number.
+    """Logarithm of Eq. 9 over every ``stride``-th usable beam where a surface is expected; and their number.
 
-    A range that is no number, not positive or beyond the longest says nothing, nor does a beam without expectation.
+    A range is not usable if it is not finite, not positive or beyond the longest. A beam without an expected surface is
+    not usable either.
     """
     _, distance, kind = beams
     total, count = 0.0, 0
@@ -121,9 +123,10 @@ def sum_log(
 
 @kernel("void(f8[:, ::1], f8[::1], f8[::1], f8[::1])")
 def cast(segments: Array, eye: Array, bearing: Array, expected: Array) -> None:
-    """Range of the nearest segment (n, 4: x0, y0, x1, y1) on each evenly spaced bearing from ``eye``; inf where none.
+    """Write the range of the nearest segment (n, 4: x0, y0, x1, y1) on each evenly spaced bearing; inf where none.
 
-    A segment fills the beams between the bearings of its ends: work goes with segments and beams, not their product.
+    ``eye``: pose of the lidar. A segment fills the beams between the bearings of its ends. The cost is the sum of
+    segments and beams, not their product.
     """
     expected[:] = np.inf
     n = len(bearing)
@@ -162,11 +165,11 @@ def segments_of(xy: Array) -> Array:
 
 
 def log_likelihood(segments: Array, T_ref_lidar: Array, beams: Beams, model: BeamModel, tempering: float) -> float:
-    """``ln p^(1/c)`` of Eq. 9 for a scan at a pose among surfaces; 0 where nothing can be said.
+    """``ln p^(1/c)`` of Eq. 9 for a scan at a pose among surfaces; 0 without a usable beam.
 
     Args:
         segments: (n, 4) in the reference frame.
-        T_ref_lidar: where the lidar would be there.
+        T_ref_lidar: pose of the lidar there.
         beams: evenly spaced bearings, ranges, kinds.
         model: see :class:`BeamModel`.
         tempering: c, beams per independent one, at least 1.
@@ -180,7 +183,7 @@ def log_likelihood(segments: Array, T_ref_lidar: Array, beams: Beams, model: Bea
 
 
 def mean_log(segments: Array, T_ref_lidar: Array, beams: Beams, model: BeamModel) -> float:
-    """``ln rho p`` of Eq. 9 as a mean per beam; ``rho`` makes it 0 where all hit what is expected. -inf without beams.
+    """``ln rho p`` of Eq. 9 as a mean per beam; ``rho`` makes it 0 where all beams hit as expected. -inf without beams.
 
     That is the tempering that Eq. 15 needs: all beams together weigh as much as one.
     """
@@ -189,16 +192,16 @@ def mean_log(segments: Array, T_ref_lidar: Array, beams: Beams, model: BeamModel
 
 
 def quality(segments: Array, T_ref_lidar: Array, beams: Beams, model: BeamModel) -> float:
-    """How much better the pose explains a beam than a pose that knows nothing, in nats a beam (mean); NaN if it cannot.
+    """Mean gain of a beam's log-likelihood over an uninformed pose, in nats a beam; NaN without usable beams.
 
-    Above 0 the surfaces speak for the pose. A beam at a pose that knows nothing has any range up to the longest one.
+    Above 0 the surfaces support the pose. At an uninformed pose every range up to the longest is equally likely.
     """
     total, count, row = _sum(segments, T_ref_lidar, beams, model)
     return total / count + math.log(row[FAR]) if count else math.nan
 
 
 def _sum(segments: Array, eye: Array, beams: Beams, model: BeamModel) -> tuple[float, int, Array]:
-    """Logarithm of Eq. 9, the number of beams that say something, and the model's row."""
+    """Logarithm of Eq. 9, the number of usable beams, and the model's row."""
     expected, row = np.empty(len(beams[0])), model.row()
     cast(segments, eye, beams[0], expected)
     total, count = sum_log(beams, expected, row, 1)

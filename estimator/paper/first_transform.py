@@ -1,8 +1,8 @@
-"""T1 of Eq. 14: where light, or else the prediction, puts the new scan.
+"""T1 of Eq. 14: pose of the new scan by light, or else by the prediction.
 
-Eq. 13 on the only points that light knows, the lamps seen from both bodies (``p_i = X_ref^-1 L_i`` and
-``q_i = X_new^-1 L_i``), returns ``X_ref^-1 X_new`` wherever the lamps are. So T1 is the relative pose of the light
-filter between the reference scan and the new one.
+Light gives only points of lamps seen from both bodies (``p_i = X_ref^-1 L_i`` and ``q_i = X_new^-1 L_i``). Eq. 13 on
+these returns ``X_ref^-1 X_new`` for any lamp positions. So T1 is the relative pose of the light filter between the
+reference scan and the new one.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from estimator.scan_matching.local_map import PlacedScan
 from estimator.scan_matching.scan_matcher import Prior
 
 LIKELY: Final = np.diag((0.02**2, 0.02**2, 0.005**2))
-"""Least covariance of a relative pose from light: stamps, and errors of the light model that vary with the place."""
+"""Smallest covariance of a relative pose from light: stamps, and position-dependent errors of the light model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class First:
-    """T1 of Eq. 14, and how well it explains its own measurement (Eq. 6).
+    """T1 of Eq. 14, and its fit to its own measurement (Eq. 6).
 
     Attributes:
-        T: pose of the new base. L: its information, in the axes of the frame it is given in.
-        misfit: mean squared deviation of the links. links: their number, 0 where light is paused.
+        T: pose of the new base.
+        L: its information, in the axes of its frame.
+        misfit: mean squared normalised residual of the links.
+        links: their number, 0 where light is paused.
     """
 
     T: Array
@@ -49,9 +51,9 @@ def from_light(reference: PlacedScan, now: Virtual, misfit: float) -> First:
     The correlation of the two positions' errors is unknown. Their sum as the relative error is never too small.
 
     Args:
-        reference: the keyframe that the scan is matched with; it has a pose from light.
-        now: the pose from light at the new scan.
-        misfit: mean squared deviation of its links.
+        reference: keyframe of the match, with a light solution.
+        now: light solution at the new scan.
+        misfit: mean squared normalised residual of its links.
     """
     ref = reference.virtual
     assert ref is not None

@@ -1,11 +1,11 @@
-"""Eq. 3 and 4: from the strengths of a few lamps to a place, with shortest-link selection and its uncertainty.
+"""Lateration (Eq. 3, 4): receiver position from the RSS of a few lamps, with shortest-link selection and covariance.
 
 Eq. 3    (x_i - x)^2 + (y_i - y)^2 = d_i^2 - h_i^2,    d_i by inversion of Eq. 1, 2 for level lamps and receiver
-Eq. 4    place = argmin sum over the Link_n shortest links of [(x_i - x)^2 + (y_i - y)^2 - (d_i^2 - h_i^2)]^2
+Eq. 4    position = argmin sum over the Link_n shortest links of [(x_i - x)^2 + (y_i - y)^2 - (d_i^2 - h_i^2)]^2
 
-Three solvers: `ls` is Eq. 4 as it stands; `lin` takes differences of Eq. 3, which are linear; `ml` fits logarithms of
-strengths, each weighted by how well it can be known, with the common gain and the diffuse floor as unknowns of their
-own. Places are those of the receiver (the photodiode), in the survey's frame, m.
+There are three solvers. `ls` is Eq. 4 as printed. `lin` takes differences of Eq. 3, which are linear. `ml` fits ln RSS,
+each weighted by its variance, with the common gain and the diffuse floor as additional unknowns. Positions are those of
+the receiver (the photodiode), in the survey frame, m.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from estimator.paper.lateration_solvers import DECIDED, SAME_M, Strengths, solve
 
 
 class Why(Enum):
-    """What the places of a result are."""
+    """Kind of a lateration result."""
 
     PLACE = "one place fits"
     MIRROR = "two places fit, the lamps alone do not tell which"
@@ -47,7 +47,7 @@ class Why(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """What is known of the receiver's place beforehand: ``xy`` (2,) and ``covariance`` (2, 2)."""
+    """Prior position of the receiver: ``xy`` (2,) and ``covariance`` (2, 2)."""
 
     xy: Array
     covariance: Array
@@ -55,11 +55,12 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """One place that fits.
+    """One position that fits.
 
     Attributes:
-        xy: (2,) m. covariance: (2, 2) m^2, expected squared error under the :class:`Doubt`.
-        chi2, freedom: of the residuals of ln strength under the same; freedom 0 where nothing is left over to judge.
+        xy: (2,) m.
+        covariance: (2, 2) m^2, expected squared error under the :class:`Doubt`.
+        chi2, freedom: of the residuals of ln RSS under the same; freedom 0 without redundant links.
         gain, floor: common ln gain and diffuse share; the survey's with `ls` and `lin`, which do not estimate them.
     """
 
@@ -73,7 +74,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """Around a single lamp; ``sigma`` of the radius, m."""
+    """Circle of positions around a single lamp; ``sigma`` of the radius, m."""
 
     x: float
     y: float
@@ -83,7 +84,7 @@ class Circle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """Result: places (best first; more than one only with `Why.MIRROR`), used links, shortest first."""
+    """Lateration result: positions (best first; more than one only with `Why.MIRROR`), used links, shortest first."""
 
     why: Why
     places: tuple[Place, ...] = ()
@@ -94,9 +95,9 @@ class Located:
 def locate(
     received: Received, survey: Survey, settings: SolverSettings | None = None, prior: Prior | None = None
 ) -> Located:
-    """Where the receiver is according to these strengths; never raises for bad geometry, but says what is not known.
+    """Receiver position from these RSS; bad geometry raises nothing, and the result contains the ambiguity.
 
-    With two links, or lamps in a line, two places fit that mirror each other: ``prior`` chooses, where it can.
+    With two links, or collinear lamps, two mirrored positions fit: ``prior`` selects one, where it can.
     """
     settings = SolverSettings() if settings is None else settings
     links = usable(received, survey, settings)
@@ -114,7 +115,7 @@ def locate(
 
 
 def _decide(places: list[Place], used: tuple[int, ...], prior: Prior | None) -> Located:
-    """One place, or several that only the prior can tell apart."""
+    """One position, or several that only the prior can separate."""
     if not places:
         return Located(Why.NO_FIT, used=used)
     if len(places) == 1:
@@ -132,13 +133,13 @@ def _decide(places: list[Place], used: tuple[int, ...], prior: Prior | None) -> 
 
 def _circle(links: Links, doubt: Doubt) -> Circle:
     radius = float(np.sqrt(max(links.range2[0], 0.0)))
-    wide = 2.0 * links.d[0] ** 2 / links.exponent[0] * np.sqrt(links.covariance(doubt)[0, 0])  # of the squared radius
+    wide = 2.0 * links.d[0] ** 2 / links.exponent[0] * np.sqrt(links.covariance(doubt)[0, 0])  # of radius^2
     sigma = wide / (radius + np.sqrt(radius**2 + wide))
     return Circle(float(links.xy[0, 0]), float(links.xy[0, 1]), radius, float(sigma))
 
 
 def _place(links: Links, survey: Survey, settings: SolverSettings, theta: Array) -> Place:
-    """Uncertainty and fit at a solution."""
+    """Covariance and fit at a solution."""
     chi2 = Strengths(links, survey, settings).chi2(theta)
     covariance = expected_error(links, survey, settings, theta[:2])
     return Place(theta[:2].copy(), covariance, chi2, max(len(links.d) - 2, 0), float(theta[2]), float(theta[3]))

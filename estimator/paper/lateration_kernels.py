@@ -1,4 +1,4 @@
-"""Compiled kernels of `lateration`: descent to a place, from received strengths or from ranges."""
+"""Compiled kernels of `lateration`: descent to a position, from RSS or from ranges."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.jit import kernel
 
 STEPS: Final = 80
-"""A descent from a metre away needs 5 to 12; only to the line between lamps in a row is it slow (quartic)."""
+"""Most steps; a descent from a metre away needs 5 to 12, more only to the line of collinear lamps (quartic)."""
 LONGEST_M: Final = 1.5
-"""No step is longer: the model is far from linear over more than that."""
+"""Longest step, m: the model is far from linear over more than that."""
 SETTLED_M: Final = 1e-7
 LATE: Final = 10
 GAINED: Final = 1e-2
-"""One that still lowers the cost by that part in the last few steps has not found a minimum."""
+"""Share of the cost; a larger decrease in the last ``LATE`` steps means that there is no minimum yet."""
 FAINTEST: Final = 1e-5
-"""Of the strength right below the lamp: expectations are not let fall below it, so that logarithms stay finite."""
+"""Smallest expected RSS relative to that directly below the lamp, so that logarithms stay finite."""
 
 
 @kernel("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])")
@@ -30,7 +30,7 @@ def strength_step(lamps: Array, rx: Array, data: Array, prior: Array, theta: Arr
     Args:
         lamps: (n, 7) as of `estimator.light_filter.lambertian`.
         rx: (9,) as of `estimator.light_filter.lambertian`.
-        data: (2, n) ln amplitude and its weight, 1 / variance.
+        data: (2, n) ln RSS and its weight, 1 / variance.
         prior: yaw, and for common gain and floor: mean gain, its weight, mean floor, its weight.
         theta: x, y of the receiver, common ln gain, floor.
         normal: (4, 5) is filled with the information matrix and, in the last column, minus the gradient.
@@ -90,13 +90,13 @@ def range_step(lamps: Array, data: Array, theta: Array, normal: Array) -> float:
 
 @kernel("b1(f8[:, ::1], f8, f8[::1])", inner=True)
 def damped(normal: Array, damping: float, step: Array) -> bool:
-    """Levenberg's step, shortened to `LONGEST_M` in the plane; whether it is a number at all."""
+    """Write Levenberg's step, limited to `LONGEST_M` in the plane; returns whether it is finite."""
     n = normal.shape[0]
     a = np.empty((n, n))
     for j in range(n):
         for k in range(n):
             a[j, k] = normal[j, k]
-        scale = max(normal[0, 0], normal[1, 1]) if j < 2 else normal[j, j]  # x and y alike: the axes mean nothing
+        scale = max(normal[0, 0], normal[1, 1]) if j < 2 else normal[j, j]  # x and y have arbitrary directions
         a[j, j] += damping * scale + 1e-12
     invert(a)
     for j in range(n):
@@ -111,7 +111,7 @@ def damped(normal: Array, damping: float, step: Array) -> bool:
 
 @kernel("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])")
 def by_strength(lamps: Array, rx: Array, data: Array, prior: Array, theta: Array, normal: Array) -> float:
-    """Descend from ``theta`` (changed in place) by `strength_step`; returns the cost, inf if it did not settle."""
+    """Descend from ``theta`` (changed in place) by `strength_step`; returns the cost, inf if it did not converge."""
     cost = strength_step(lamps, rx, data, prior, theta, normal)
     damping, step, trial, system, late = 1e-3, np.zeros(4), np.zeros(4), np.zeros((4, 5)), cost
     for k in range(STEPS):
@@ -120,7 +120,7 @@ def by_strength(lamps: Array, rx: Array, data: Array, prior: Array, theta: Array
         if not damped(normal, damping, step):
             return np.inf
         trial[:] = theta + step
-        trial[3] = max(trial[3], 0.0)  # there is no negative light
+        trial[3] = max(trial[3], 0.0)  # RSS is not negative
         moved = np.hypot(step[0], step[1]) + abs(step[2])
         new = strength_step(lamps, rx, data, prior, trial, system)
         if new <= cost:
@@ -134,7 +134,7 @@ def by_strength(lamps: Array, rx: Array, data: Array, prior: Array, theta: Array
 
 @kernel("f8(f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1])")
 def by_range(lamps: Array, data: Array, theta: Array, normal: Array) -> float:
-    """Descend from ``theta`` (changed in place) by `range_step`; returns the cost, inf if it did not settle."""
+    """Descend from ``theta`` (changed in place) by `range_step`; returns the cost, inf if it did not converge."""
     cost = range_step(lamps, data, theta, normal)
     damping, step, trial, system, late = 1e-3, np.zeros(2), np.zeros(2), np.zeros((2, 3)), cost
     for k in range(STEPS):

@@ -1,6 +1,6 @@
-"""What links are to the solvers of Eq. 4: strengths of known lamps, how well they can be known, and which to use.
+"""Link model of the lateration solvers (Eq. 4): RSS of known lamps, their noise, and the usable links.
 
-Uncertainty is propagated from one model of what is not known (:class:`Doubt`), whichever solver is used.
+One noise model (:class:`Doubt`) gives the covariance for every solver.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Index = npt.NDArray[np.int64]
 LINK_N: Final = 4
 """The paper's number of links."""
 SANE: Final = (1e-6, 1e3)
-"""Strengths outside these bounds, relative to that right below the lamp, are no light of this lamp."""
+"""Limits of a plausible RSS, relative to that directly below the lamp."""
 IN_LINE: Final = 0.02
-"""Lamps whose spread across their line is less than this part of that along it stand in a line."""
+"""Largest ratio of the spread across to the spread along the line of collinear lamps."""
 
 
 class Solver(Enum):
-    """How a place is found."""
+    """Method to solve for the position."""
 
     LS = "ls"
     LIN = "lin"
@@ -37,12 +37,13 @@ class Solver(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """One sigma of what makes received strengths differ from Eq. 1, 2, beside each lamp's own ``sigma_ln``.
+    """One sigma of the differences between RSS and Eq. 1, 2, beside each lamp's own ``sigma_ln``.
 
     Attributes:
-        common_ln: of the gain all links share (receiver, dimming). tilt: rad, of lamps and receiver together.
-        floor: of the diffuse share that all links have in common. floor_own: of that part of it that differs from
-            link to link (light by way of near walls), as a share of the strength right below the lamp.
+        common_ln: of the gain that all links share (receiver, dimming).
+        tilt: rad, of lamps and receiver together.
+        floor: of the diffuse share that all links have in common.
+        floor_own: of its part that differs between links (light from near walls), as a share of the RSS below the lamp.
     """
 
     common_ln: float = 0.05
@@ -53,14 +54,17 @@ class Doubt:
 
 @dataclass(frozen=True, slots=True)
 class SolverSettings:
-    """How to solve.
+    """Settings of the solver.
 
     Attributes:
-        link_n: how many of the shortest links to use; None: all. adaptive: leave out what contradicts the other links,
-            and choose the number (up to ``link_n``) by the error it is expected to leave.
-        rim: links weaker than this part of a level lamp's strength at the edge of the field of view are left out:
-            they came by walls alone. 0: none is left out.
-        yaw: of base_link in the map, where the receiver leans; without effect for a level one.
+        solver: see :class:`Solver`.
+        link_n: number of the shortest links in use; None: all.
+        adaptive: exclude links inconsistent with the others, and choose the number (up to ``link_n``) by the expected
+            error.
+        doubt: noise model.
+        rim: links below this share of a level lamp's RSS at the edge of the field of view are excluded: their light
+            came from walls alone. 0: none is excluded.
+        yaw: of base_link in the map, for a tilted receiver; without effect for a level one.
     """
 
     solver: Solver = Solver.ML
@@ -73,7 +77,7 @@ class SolverSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Received:
-    """Links whose lamp is known: ``amplitude`` (n,) A and ``variance`` (n,) A^2, in the order of ``lamps``."""
+    """Links of known lamps: ``amplitude`` (n,) A and ``variance`` (n,) A^2, in the order of ``lamps``."""
 
     lamps: tuple[Lamp, ...]
     amplitude: Array
@@ -92,7 +96,7 @@ class Received:
 
 
 def strength_below(lamps: Sequence[Lamp], survey: Survey) -> Array:
-    """(n,) A, amplitude right below each lamp, levelled, without floor."""
+    """(n,) A, RSS directly below each lamp, levelled, without diffuse floor."""
     return _below(pack_lamps(lamps, survey.depth), pack_receiver(survey.receiver))
 
 
@@ -107,11 +111,17 @@ class Links:
     """Links ready to be solved; arrays have one element per link.
 
     Attributes:
-        table: (n, 7) lamps and rx: (9,) receiver, as of `estimator.light_filter.lambertian`. at: index in what was
-        received. xy: (n, 2) of the lamps, and h: their height above the receiver, m. amplitude: A. exponent: of
-        distance in Eq. 1 for level lamp and receiver. d: distance by inversion of Eq. 1, 2, m. range2: squared
-        horizontal range of Eq. 3, m^2; may be negative. rim: amplitude at the edge of the field of view, A. diffuse: of
-        the amplitude, per unit of floor. variance: of ln amplitude, all but what links share.
+        table: (n, 7) lamps, and rx: (9,) receiver, as of `estimator.light_filter.lambertian`.
+        at: index among the received links.
+        xy: (n, 2) of the lamps, m.
+        h: their height above the receiver, m.
+        amplitude: RSS, A.
+        exponent: of the distance in Eq. 1 for level lamp and receiver.
+        d: distance by inversion of Eq. 1, 2, m.
+        range2: squared horizontal range of Eq. 3, m^2; may be negative.
+        rim: RSS at the edge of the field of view, A.
+        diffuse: share of the RSS per unit of diffuse floor.
+        variance: of ln RSS, without the part that links share.
     """
 
     table: Array
@@ -142,17 +152,17 @@ class Links:
         return residuals
 
     def covariance(self, doubt: Doubt) -> Array:
-        """(n, n) of ln strength, what links share included."""
+        """(n, n) of ln RSS, with the part that links share."""
         shared = doubt.common_ln**2 + doubt.floor**2 * np.outer(self.diffuse, self.diffuse)
         total: Array = np.diag(self.variance) + shared
         return total
 
 
 def usable(received: Received, survey: Survey, settings: SolverSettings) -> Links:
-    """Links that can be light of their lamps and came straight (see `SolverSettings.rim`), the shortest first."""
+    """Links with a plausible RSS in line of sight (see `Method.rim`), the shortest first."""
     table, rx = pack_lamps(received.lamps, survey.depth), pack_receiver(survey.receiver)
     below = _below(table, rx)
-    with np.errstate(invalid="ignore"):  # a strength that is not a number is not within bounds, and says no more
+    with np.errstate(invalid="ignore"):  # NaN fails both comparisons
         fit = (received.amplitude > SANE[0] * below) & (received.amplitude < SANE[1] * below)
         fit &= (received.variance >= 0.0) & (received.variance < (SANE[1] * below) ** 2)
     at = np.flatnonzero(fit)
@@ -172,12 +182,12 @@ def usable(received: Received, survey: Survey, settings: SolverSettings) -> Link
 
 
 def shortest(received: Received, survey: Survey, rim: float = 0.0) -> tuple[int, ...]:
-    """Usable links (positive, finite, not below ``rim``), the shortest first; equal lamps: the strongest first."""
+    """Usable links (positive, finite, not below ``rim``), the shortest first; for equal lamps the strongest first."""
     return tuple(usable(received, survey, SolverSettings(rim=rim)).at.tolist())
 
 
 def without_floor(received: Received, survey: Survey) -> Received:
-    """The same with the survey's diffuse floor taken off (at most 95 % of a link)."""
+    """The same links without the survey's diffuse floor (at most 95 % of a link)."""
     floor = survey.floor * strength_below(received.lamps, survey)
     return Received(
         received.lamps, np.maximum(received.amplitude - floor, 0.05 * received.amplitude), received.variance
@@ -185,7 +195,7 @@ def without_floor(received: Received, survey: Survey) -> Received:
 
 
 def spread(xy: Array) -> tuple[float, float, Array]:
-    """Standard deviations along and across the main axis of some places, and that axis (a unit vector)."""
+    """Standard deviations along and across the main axis of some positions, and that axis (a unit vector)."""
     x, y = (xy - xy.mean(axis=0)).T
     xx, yy, xy_ = float(x @ x), float(y @ y), float(x @ y)
     angle = 0.5 * np.arctan2(2.0 * xy_, xx - yy)
@@ -195,7 +205,7 @@ def spread(xy: Array) -> tuple[float, float, Array]:
 
 
 def in_line(xy: Array) -> bool:
-    """Whether lamps stand in a line, so that every place has a mirror image."""
+    """Whether lamps are collinear, so that every position has a mirror image."""
     along, across, _ = spread(xy)
     return across < IN_LINE * along
 
@@ -203,8 +213,8 @@ def in_line(xy: Array) -> bool:
 def expected_error(links: Links, survey: Survey, settings: SolverSettings, xy: Array) -> Array:
     """(2, 2) expected squared error of a solver at ``xy``, m^2: its sensitivity to errors times their covariance.
 
-    `ls` and `lin` do not know of the floor: what it does to them is a bias, and counted in. No direction is more
-    uncertain than the curvature of the circles allows (lamps in a line, the place between them).
+    `ls` and `lin` ignore the diffuse floor; its effect on them is included as a bias. The curvature of the circles
+    limits the error in every direction (collinear lamps, the position between them).
     """
     off = xy - links.xy
     d2 = np.sum(off**2, axis=1) + links.h**2
@@ -220,7 +230,7 @@ def expected_error(links: Links, survey: Survey, settings: SolverSettings, xy: A
         differences = settings.solver is Solver.LIN and not in_line(links.xy)
         covariance = _sandwich(2.0 * (off - off.mean(axis=0) if differences else off), moment)
     size, axes = np.linalg.eigh(covariance)
-    own = 2.0 * d2 / links.exponent * np.sqrt(np.diag(errors))  # of each squared range
+    own = 2.0 * d2 / links.exponent * np.sqrt(np.diag(errors))  # sigma of each squared range
     combined = np.sum(own**-2.0) ** -0.5 if settings.solver is Solver.ML else np.sqrt(np.sum(own**2)) / len(own)
     capped: Array = (axes * np.clip(size, 1e-12, combined)) @ axes.T
     return capped
@@ -236,7 +246,7 @@ def _sandwich(rows: Array, moment: Array) -> Array:
 
 
 def _capped_inverse(a: Array) -> Array:
-    """Inverse of a symmetric matrix, 1e12 along directions in which it says nothing."""
+    """Inverse of a symmetric matrix, 1e12 along directions without information."""
     size, axes = np.linalg.eigh(a)
     inverse: Array = (axes / np.maximum(size, 1e-12)) @ axes.T
     return inverse

@@ -1,4 +1,4 @@
-"""The three solvers of Eq. 4, each from links to the places that fit, best first."""
+"""The three solvers of Eq. 4 (`ls`, `lin`, `ml`): from links to the positions that fit, best first."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from estimator.paper.lateration_kernels import by_range, by_strength, strength_s
 from estimator.paper.lateration_model import Links, Solver, SolverSettings, in_line, spread
 
 DECIDED: Final = 6.0
-"""Difference of chi2 from which the worse of two places is given up: likelihoods 20 to 1."""
+"""Difference of chi2 at which the worse of two positions is discarded: likelihoods 20 to 1."""
 SAME_M: Final = 0.02
-"""Two descents that end this close have found the same place."""
+"""Distance (m) within which two descents have found the same position."""
 
 Solution = tuple[float, Array]
 """Cost, and x, y of the receiver (m), common ln gain, floor."""
 
 
 def solve(links: Links, survey: Survey, settings: SolverSettings) -> list[Array]:
-    """Places that fit at least two links whose lamps are apart, as (x, y, common ln gain, floor), best first."""
+    """Positions that fit at least two links of separate lamps, as (x, y, common ln gain, floor), best first."""
     return SOLVERS[settings.solver](links, survey, settings)
 
 
 def mirrored(xy: Array, place: Array) -> Array:
-    """``place`` seen in the main axis of lamps at ``xy`` as in a mirror."""
+    """Mirror image of ``place`` in the main axis of lamps at ``xy``."""
     centre, axis = xy.mean(axis=0), spread(xy)[2]
     off = place - centre
     image: Array = centre + 2.0 * (off @ axis) * axis - off
@@ -35,7 +35,7 @@ def mirrored(xy: Array, place: Array) -> Array:
 
 
 def linear(links: Links) -> list[Array]:
-    """Eq. 3, differences from the mean over all links: one place, or the mirror pair for lamps in a line."""
+    """Eq. 3, differences from the mean over all links: one position, or the mirror pair for collinear lamps."""
     centre = links.xy.mean(axis=0)
     xy = links.xy - centre
     right = np.sum(xy**2, axis=1) - links.range2
@@ -53,13 +53,13 @@ def linear(links: Links) -> list[Array]:
 
 
 def starts(links: Links) -> list[Array]:
-    """Where descents begin: the linear solution, its mirror image, and the middle of the lamps."""
+    """Starts of the descents: the linear solution, its mirror image, and the centre of the lamps."""
     found = linear(links)
     return [*found, mirrored(links.xy, found[0]), links.xy.mean(axis=0) + SAME_M]
 
 
 def distinct(found: Sequence[Solution], margin: float) -> list[Solution]:
-    """Ends of descents, best first, no place twice, none worse than the best by ``margin`` or more."""
+    """Ends of descents, best first, no position twice, none worse than the best by ``margin`` or more."""
     settled = sorted((f for f in found if np.isfinite(f[0])), key=lambda f: f[0])
     kept: list[Solution] = []
     for cost, theta in settled:
@@ -69,23 +69,23 @@ def distinct(found: Sequence[Solution], margin: float) -> list[Solution]:
 
 
 class Strengths:
-    """Weighted fit of ln strength with the common gain and the floor as unknowns that have priors."""
+    """Weighted fit of ln RSS, with the common gain and the floor as unknowns that have priors."""
 
     def __init__(self, links: Links, survey: Survey, settings: SolverSettings) -> None:
         doubt = settings.doubt
         gain, floor = (1.0 / max(sigma, 1e-6) ** 2 for sigma in (doubt.common_ln, doubt.floor))
         self._table, self._rx = links.table, links.rx.copy()
-        self._rx[6] = -1.0  # what is received has been seen: descents need no cliff at the edge of the field of view
+        self._rx[6] = -1.0  # received lamps are in view: descents need no cliff at the edge of the field of view
         self._data = np.vstack((np.log(links.amplitude), 1.0 / links.variance))
         self._prior = np.array((settings.yaw, 0.0, gain, survey.floor, floor))
         self._system = np.empty((4, 5))
 
     def chi2(self, theta: Array) -> float:
-        """Of a solution, priors included."""
+        """chi2 of a solution, priors included."""
         return float(strength_step(self._table, self._rx, self._data, self._prior, theta, self._system))
 
     def descend(self, theta: Array) -> Solution:
-        """From a start to a minimum; cost inf where none was reached."""
+        """Descend from a start to a minimum; cost inf where none was reached."""
         end = theta.copy()
         return by_strength(self._table, self._rx, self._data, self._prior, end, self._system), end
 
@@ -95,7 +95,7 @@ def _by_lines(links: Links, survey: Survey, settings: SolverSettings) -> list[Ar
 
 
 def _by_range(links: Links, survey: Survey, settings: SolverSettings) -> list[Array]:
-    """Eq. 4: the least of its minima, or both of a mirror pair."""
+    """Eq. 4: the smallest of its minima, or both of a mirror pair."""
     data, system = np.vstack((links.range2, np.ones(len(links.d)))), np.empty((2, 3))
     found = []
     for start in starts(links):

@@ -1,11 +1,11 @@
-"""The paper's light filter: an EKF of wheels and of places by the shortest links (Eq. 5-7).
+"""The paper's light filter: an EKF of odometry and of positions by the shortest links (Eq. 5-7).
 
-    Eq. 5    z = h(x) + delta, delta ~ N(0, Q):    z place of the receiver by Eq. 3, 4; h(x) = p + R(theta) l
-    Eq. 6    p(z | x):                             Q the place's covariance; how well the links fit is `misfit`
+    Eq. 5    z = h(x) + delta, delta ~ N(0, Q):    z receiver position by Eq. 3, 4; h(x) = p + R(theta) l
+    Eq. 6    p(z | x):                             Q the position's covariance; `misfit` is the fit of the links
     Eq. 7    J = dh/dx = [1  R'(theta) l]
 
-x = (p, theta) is the pose of the base in the survey's frame, l the receiver's lever arm. A photodiode alone gives no
-heading. So the start collects places along the way of the wheels and brings one onto the other by Eq. 13.
+x = (p, theta) is the pose of the base in the survey frame, l the receiver's lever arm. A single photodiode gives no
+heading. So the initialisation collects positions along the odometry path and aligns the two by Eq. 13.
 """
 
 from __future__ import annotations
@@ -32,29 +32,31 @@ from estimator.paper.shortest_link import PAUSED, links_of, misfit, select
 from estimator.result import Fix, LightsResult, Virtual
 
 BASE_M: Final = 1.0
-"""Extent of the way over which the start is aligned."""
+"""Extent of the path over which the initialisation aligns, m."""
 APART_M: Final = 0.05
-"""Way between two places of the start."""
+"""Path length between two positions of the initialisation, m."""
 PLACES: Final = 200
-"""Most places of a start; the oldest are dropped, so that wheels that slipped do not hold it up for good."""
+"""Most positions of an initialisation; the oldest are dropped, so that wheel slip does not block it for good."""
 FITS: Final = 0.5
-"""RMS distance of the places from the aligned way, as a share of the way's own RMS extent, up to which a start is
-taken."""
+"""Largest RMS distance of the positions from the aligned path, as a share of the path's RMS extent, for acceptance."""
 STALE_S: Final = 0.5
-"""Age from which the latest epoch gives no pose any more."""
+"""Age (s) from which the latest epoch gives no pose any more."""
 
 
 class LightPose:
     """The light solution by the paper's means.
 
     Attributes:
-        settings: solver and Link_n. T, P: pose (x, y, yaw) and covariance (3, 3) at ``t_mono``; in the survey's frame
-            once ``placed``, before that in the frame of the wheels' start. velocity: (v_x, v_y, yaw rate), base frame.
-        selection: links and place of the latest epoch. result: after the latest epoch.
+        settings: solver and Link_n.
+        T, P: pose (x, y, yaw) and covariance (3, 3) at ``t_mono``. They are in the survey frame once ``placed``, before
+            that in the frame of the odometry's start.
+        velocity: (v_x, v_y, yaw rate), base frame.
+        selection: links and position of the latest epoch.
+        result: after the latest epoch.
     """
 
     def __init__(self, setup: LightsSetup, noise: MotionNoise, link_n: int = LINK_N) -> None:
-        """Nothing received yet; raises ValueError for an impossible survey or stored sample clock."""
+        """Create the initial state; raises ValueError for an impossible survey or stored sample clock."""
         self.setup, self.noise = setup, noise
         self.settings = SolverSettings(Solver.LS, link_n)
         self.decoder = decoder.new_decoder(setup.profile, setup.clock_ppm, {lamp.code for lamp in setup.survey.lamps})
@@ -68,7 +70,7 @@ class LightPose:
         self.result = self._result(None)
 
     def take(self, record: Record) -> None:
-        """Take wheels, a block of samples or an epoch; other records are passed over."""
+        """Process odometry, a block of samples or an epoch; ignore other records."""
         match record:
             case Odometry():
                 self.move(record)
@@ -82,7 +84,7 @@ class LightPose:
         decoder.search(self.decoder, codes)
 
     def move(self, record: Odometry) -> None:
-        """Prediction: the pose and its covariance after an increment of the wheels."""
+        """Prediction: the pose and its covariance after an odometry increment."""
         dt = record.t_end - record.t_begin
         if not (dt > 0.0 and np.isfinite(record.delta).all()):
             return
@@ -99,7 +101,7 @@ class LightPose:
         return se2.compose(self.T, se2.exp(self.velocity * dt)) if abs(dt) < STALE_S else self.T
 
     def update(self, epoch: LightEpoch) -> None:
-        """Eq. 3-7: select the links, solve for the place, and take it into the pose or into the start."""
+        """Eq. 3-7: select the links, solve for the position, and update the pose or the initialisation with it."""
         T = self.at(0.5 * (epoch.t_begin + epoch.t_end))
         receiver, J = self._receiver(T)
         prior = Prior(receiver, J @ self.P @ J.T + 1e-6 * np.eye(2)) if self.placed else None
@@ -113,7 +115,7 @@ class LightPose:
         self.result = self._result(epoch)
 
     def virtual(self, t_mono: float) -> Virtual | None:
-        """The light solution at an instant: the virtual consistent components; None while light is paused."""
+        """The light solution at an instant: the virtual components; None while light is paused."""
         accepted = self.selection.accepted
         if not (self.placed and accepted and t_mono - self.t_epoch < STALE_S):
             return None
@@ -125,12 +127,12 @@ class LightPose:
         return 0.0 if used is None else misfit(used, self.settings, self._receiver(self.at(self.t_epoch))[0])
 
     def _receiver(self, T: Array) -> tuple[Array, Array]:
-        """Place (2,) of the receiver with the base at ``T``, and its Jacobian (2, 3) by that pose (Eq. 7)."""
+        """Position (2,) of the receiver with the base at ``T``, and its Jacobian (2, 3) by that pose (Eq. 7)."""
         lever = se2.rotation(T[2])[:2, :2] @ self.lever
         return T[:2] + lever, np.array(((1.0, 0.0, -lever[1]), (0.0, 1.0, lever[0])))
 
     def _correct(self, place: Place, receiver: Array, J: Array) -> None:
-        """EKF update by a place (Joseph form)."""
+        """EKF update by a position (Joseph form)."""
         K = self.P @ J.T @ np.linalg.inv(J @ self.P @ J.T + place.covariance)
         keep = np.eye(3) - K @ J
         self.T = self.T + K @ (place.xy - receiver)
@@ -138,7 +140,7 @@ class LightPose:
         self.P = symmetric(keep @ self.P @ keep.T + K @ place.covariance @ K.T)
 
     def _begin(self, place: Place, receiver: Array) -> None:
-        """Keep a place, and align the way of the wheels with the places once it is long enough (Eq. 13)."""
+        """Keep a position, and align the odometry path with the positions once it is long enough (Eq. 13)."""
         if self._start and math.dist(self._start[-1][0], receiver) < APART_M:
             return
         self._start.append((receiver, place.xy))

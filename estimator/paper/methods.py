@@ -1,17 +1,17 @@
-"""Methods that are run by name: the paper's as printed, its baseline pIC, and the daemon's own, with one interface.
+"""Methods that run by name, with one interface: the paper's as printed, its baseline pIC, and the daemon's own.
 
-The paper's method, and where each of its equations is:
+The equations of the paper's method, and their code:
 
 | paper | what | where |
 |---|---|---|
 | Eq. 1, 2 | a lamp's RSS; inverted, its distance | `lateration_model.usable` |
-| Eq. 3, 4 | the place by the Link_n shortest links (4, solver `ls`) | `shortest_link.select`, `lateration.locate` |
-| Eq. 5-7 | the EKF of places and wheels: the virtual consistent components | `light_pose.LightPose` |
-| Eq. 8, 9 | how probable the scan is at a pose | `beam_model.mean_log` |
+| Eq. 3, 4 | position by the Link_n shortest links (4, solver `ls`) | `shortest_link.select`, `lateration.locate` |
+| Eq. 5-7 | the EKF of positions and odometry: the virtual components | `light_pose.LightPose` |
+| Eq. 8, 9 | probability of the scan at a pose | `beam_model.mean_log` |
 | Eq. 10-12 | virtual frame and fused axis: the distance region | `point_to_point.pair_up` |
 | Eq. 13 | T1 from light, T2 from the lidar | `first_transform.from_light`, `point_to_point_sums.closed_form` |
-| Eq. 14, 15 | the two weighted by one number | `pose_weighting.combine`, `pose_weighting.paper_weight` |
-| Sect. 4.2 | scan to scan: all of this until it stands still | `registration.PointToPoint` |
+| Eq. 14, 15 | both weighted by one number | `pose_weighting.combine`, `pose_weighting.paper_weight` |
+| Sect. 4.2 | scan to scan: all of this until convergence | `registration.PointToPoint` |
 | Sect. 4.3 | scan to map: the same weight on the pose in the map, at keyframes | `PaperMethod.step` |
 | Sect. 4.3 | the pause: no light at all while fewer than Link_n links are clear | `shortest_link.select` |
 
@@ -45,7 +45,7 @@ from estimator.state import Settings, State
 
 
 class Method(Protocol):
-    """An estimator with its state inside. ``lit``: whether it uses a photodiode."""
+    """Interface of an estimator with its state. ``lit``: whether it uses a photodiode."""
 
     @property
     def lit(self) -> bool:
@@ -53,22 +53,22 @@ class Method(Protocol):
 
     @property
     def state(self) -> State:
-        """Keyframes, map and settings, as `pipeline.keyframe_poses` and `pipeline.render_map` take them."""
+        """Keyframes, map and settings, as input of `pipeline.keyframe_poses` and `pipeline.render_map`."""
 
     def step(self, records: Iterable[Record], limits: Limits, lap: Lap = no_lap) -> StepResult:
-        """Take the records since the last step; as `pipeline.step`."""
+        """Process the records since the last step; as `pipeline.step`."""
 
 
 class PipelineMethod:
     """The pipeline as it is, with the given settings."""
 
     def __init__(self, settings: Settings, lights: LightsSetup | None) -> None:
-        """A robot that has just been switched on; raises ValueError as `pipeline.new_state`."""
+        """Create the state of a start; raises ValueError as `pipeline.new_state`."""
         self.state = pipeline.new_state(settings, lights)
         self.lit = lights is not None
 
     def step(self, records: Iterable[Record], limits: Limits, lap: Lap = no_lap) -> StepResult:
-        """Take the records since the last step."""
+        """Process the records since the last step."""
         return pipeline.step(self.state, records, limits, lap)
 
 
@@ -81,12 +81,13 @@ class PaperMethod:
     """The paper's method. Without a photodiode T1 is the prediction and has no weight.
 
     Attributes:
-        light: the light solution, None without a photodiode. matcher: the scan matcher, which takes T1 from it.
-        placed: the map frame is the survey's.
+        light: the light solution, None without a photodiode.
+        matcher: the scan matcher, with T1 from it.
+        placed: whether the map frame is the survey frame.
     """
 
     def __init__(self, settings: Settings, lights: LightsSetup | None, link_n: int = LINK_N) -> None:
-        """A robot that has just been switched on; raises ValueError for an impossible survey or sample clock."""
+        """Create the state of a start; raises ValueError for an impossible survey or sample clock."""
         self.light = None if lights is None else LightPose(lights, settings.noise, link_n)
         self.lit = lights is not None
         self.matcher = PointToPoint(settings.far_m, first=self._first)
@@ -96,7 +97,7 @@ class PaperMethod:
         self._before: tuple[float, Array] | None = None
 
     def step(self, records: Iterable[Record], limits: Limits, lap: Lap = no_lap) -> StepResult:
-        """Take the records since the last step: light first, up to the scan; then the scan, with T1 from light."""
+        """Process the records since the last step: light first, up to the scan; then the scan, with T1 from light."""
         ordered = sorted(records, key=pipeline.order)
         if self.light is None:
             return pipeline.step(self.state, ordered, limits, lap)
@@ -138,7 +139,7 @@ class PaperMethod:
     def _scan_to_map(self, result: StepResult) -> None:
         """Eq. 14 for a keyframe in the map: T1 is the light solution, T2 the pose by the lidar, the weight as matched.
 
-        The first light solution places the whole map. Later ones move the newest submap with the robot.
+        The first light solution aligns the whole map. Later ones move the newest submap with the robot.
         """
         light = self._virtual()
         if light is None:
@@ -153,7 +154,7 @@ class PaperMethod:
         self.placed = True
 
     def _guide(self, result: StepResult) -> None:
-        """Without wheels, the motion between steps moves the light solution."""
+        """Without odometry, the motion between steps moves the light solution."""
         assert self.light is not None
         before, self._before = self._before, (result.t_mono, result.T_odom_base)
         if before is not None and not self.state.motion.odometry:

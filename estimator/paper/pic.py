@@ -1,9 +1,9 @@
 """pIC, the paper's baseline: probabilistic iterative correspondence (Montesano, Minguez, Montano, IROS 2005).
 
-The displacement q and every point are Gaussian. For each new point all reference points that are statistically
-compatible with it are integrated into one virtual partner, mean and covariance, and the displacement that makes the
-Mahalanobis distances to those least is sought by Gauss-Newton; and again, with the displacement's new covariance.
-Kept for experiments: it knows no surfaces and no light, and its covariance trusts pairs along a wall.
+The displacement q and every point are Gaussian. For each new point, all statistically compatible reference points are
+combined into one virtual partner, with mean and covariance. Gauss-Newton then minimises the Mahalanobis distances to
+the partners. The displacement's new covariance starts the next iteration. It serves experiments only: it has no
+surfaces and no light, and its covariance trusts pairs along a wall.
 """
 
 from __future__ import annotations
@@ -17,16 +17,19 @@ from estimator.scan_matching import icp
 from estimator.scan_matching.distance_axis import ray_distance2, turn_of
 
 COMPATIBLE = 5.991
-"""Squared Mahalanobis distance within which two points may be one: chi-squared, 2 degrees of freedom, 95 %."""
+"""Squared Mahalanobis distance of compatible points: chi-squared, 2 degrees of freedom, 95 %."""
 
 LEAST, SHRINK = 4.0, 0.25
-"""How far, in deviations of a point, the displacement moves it at least; and how fast its variance shrinks."""
+"""Smallest displacement of a point by the displacement's covariance, in sigmas of a point.
+
+SHRINK: smallest factor on that variance per iteration.
+"""
 
 CAP, NOISE, ACROSS, SETTLED, EYE_X, EYE_Y = range(6)
-"""Places in ``how``: iteration cap, range noise, bearing noise (rad), way that ends it (m), lidar in the base frame."""
+"""Indices in ``how``: iteration cap, range noise, bearing noise (rad), final step (m), lidar in the base frame."""
 
 Reference = tuple[Array, Ints, Array]
-"""Rows, start and rays of the axis, its centre the reference's lidar."""
+"""Rows, start and rays of the axis, centred on the reference's lidar."""
 
 Spread = tuple[float, float, float]
 """Covariance of a point: xx, xy, yy."""
@@ -44,7 +47,7 @@ def spread_of(x: float, y: float, sigma: float, across: float) -> Spread:
 
 @kernel("UniTuple(f8, 3)(f8, f8, f8[:, ::1])", inner=True)
 def swung(ux: float, uy: float, P: Array) -> Spread:
-    """``J_q P J_q'``: what the pose's covariance does to a point at lever (ux, uy)."""
+    """``J_q P J_q'``: covariance of a point at lever (ux, uy) by the pose's covariance."""
     ax, ay = P[0, 2] - uy * P[2, 2], P[1, 2] + ux * P[2, 2]
     return (
         P[0, 0] - uy * P[0, 2] - uy * ax,
@@ -55,7 +58,7 @@ def swung(ux: float, uy: float, P: Array) -> Spread:
 
 @kernel("f8(UniTuple(f8, 3))", inner=True)
 def widest(S: Spread) -> float:
-    """Larger eigenvalue."""
+    """Larger eigenvalue of a covariance."""
     half = 0.5 * (S[0] - S[2])
     return float(0.5 * (S[0] + S[2]) + np.sqrt(half * half + S[1] * S[1]))
 
@@ -70,9 +73,9 @@ def gather(
 ) -> None:
     """Add the compatible points of one sector's axis, rows [low, high), to a new point's virtual partner.
 
-    ``at``: predicted point (x, y), its distance from the centre, covariance (3), farthest a compatible point can be.
-    ``sums``: of pi; pi times x, y, xx, xy, yy relative to the predicted point; pi times the points' covariance (3),
-    of pi squared.
+    ``at``: predicted point (x, y), its distance from the centre, covariance (3), largest distance of a compatible
+    point. ``sums``: of pi; pi times x, y, xx, xy, yy relative to the predicted point; pi times the points' covariance
+    (3); pi squared.
     """
     x, y, r, xx, xy, yy, reach = at
     a, b = part
@@ -114,7 +117,7 @@ def partners(
     noise: tuple[float, float],
     sums: Array,
 ) -> None:
-    """The compatible set of a point, over the sectors that can hold any of it; arguments as in :func:`gather`."""
+    """Sum the compatible set of a point, over the sectors that can contain it; arguments as in :func:`gather`."""
     rows, start, rays = reference
     sums[:] = 0.0
     x, y, r2, reach2 = at[0], at[1], at[2] * at[2], at[6] * at[6]
@@ -139,7 +142,7 @@ def partners(
 
 @kernel("void(f8[::1], UniTuple(f8, 3), UniTuple(f8, 4), f8[:, ::1], f8[::1])", inner=True)
 def add_partner(s: Array, spread: Spread, ray: tuple[float, float, float, float], A: Array, b: Array) -> None:
-    """One virtual partner in the normal equations; b (3..) also gets inliers, pairs, weights and squares.
+    """Add one virtual partner to the normal equations; b (3..) also gets inliers, pairs, weights and squares.
 
     ``s``: of :func:`gather`. ``spread``: of the predicted point. ``ray``: its lever from the base, and its direction
     from the lidar.
@@ -206,12 +209,12 @@ def sum_up(points: Array, reference: Reference, T: Array, P: Array, how: Array, 
 def iterate(
     points: Array, reference: Reference, T: Array, P: Array, how: Array, out: tuple[Array, Array, Array]
 ) -> int:
-    """Iterate pIC from ``T`` (base in the reference lidar's frame, moved in place) with covariance ``P``; their number.
+    """Iterate pIC from ``T`` (base in the reference lidar's frame, changed in place); returns the iterations.
 
-    The displacement's covariance opens the compatible sets. As the displacement is found it shrinks, no faster than
-    the steps and never below ``LEAST`` deviations of a point: a set must hold points on either side along a wall, or
-    the virtual partner pulls along it. The solution's own covariance would be there at once, and stop short of it.
-    ``out``: information, sums and trace in the layout of `icp`.
+    ``P``: the displacement's covariance, which sets the size of the compatible sets. It shrinks during the iteration,
+    no faster than the steps and never below ``LEAST`` sigmas of a point. A set must contain points on either side along
+    a wall, or the virtual partner pulls along it. The solution's own covariance would shrink at once, and the iteration
+    would stop early. ``out``: information, sums and trace in the layout of `icp`.
     """
     H, sums, trace = out
     P = P.copy()

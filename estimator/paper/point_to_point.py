@@ -1,8 +1,8 @@
-"""The paper's matcher (Sect. 4.2): closed-form point-to-point, the light's transform weighed in by probability.
+"""The paper's matcher (Sect. 4.2): closed-form point-to-point, with T1 from light weighted in by probability.
 
     T1 -> virtual frame (Eq. 10-11) -> fused axis (Eq. 12) -> pairs -> T2 (Eq. 13) -> weight (Eq. 15) -> T_k (Eq. 14)
 
-T1 is of `estimator.paper.first_transform`. The reference is the newest keyframe's scan in its lidar's frame.
+T1 is that of `estimator.paper.first_transform`. The reference is the newest keyframe's scan in its lidar's frame.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from estimator.scan_matching.distance_axis import Axis, build_axis
 from estimator.scan_matching.distance_region import Fused, fuse, pair_fused
 
 CENTRE = np.zeros(2)
-"""Of the reference's axis: its lidar."""
+"""Centre of the reference's axis: its lidar."""
 PROBES = 4
-"""Steps along the normals by which the solution's own error is looked for."""
+"""Steps along the normals that estimate the solution's own error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """The reference frame S_ref: a scan's points on the single distance axis, and what they say of surfaces.
+    """The reference frame S_ref: a scan's points on the single distance axis, with their surfaces.
 
     Attributes:
-        axis: around the lidar. surfaces: (n, 4) per row, see `point_to_point_sums.surfaces`. segments: between
-            neighbours, for the beam model.
+        axis: around the lidar.
+        surfaces: (n, 4) per row, see `point_to_point_sums.surfaces`.
+        segments: between neighbours, for the beam model.
     """
 
     axis: Axis
@@ -47,7 +48,10 @@ class New:
     """The target frame S_new.
 
     Attributes:
-        points: (m, 2) in the base frame. T_base_lidar: mount. beams: what they came from. noise_m: range noise.
+        points: (m, 2) in the base frame.
+        T_base_lidar: mount.
+        beams: of the scan.
+        noise_m: range noise.
     """
 
     points: Array
@@ -58,7 +62,15 @@ class New:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Iterations at most, farthest partner (m), last robust scale (m), way that may remain (m); the scalar weight."""
+    """Limits of the iteration.
+
+    Attributes:
+        cap: most iterations.
+        gate_m: farthest partner, m.
+        scale_m: last robust scale, m.
+        settled_m: final remaining displacement, m.
+        scalar: whether the weight is the paper's scalar.
+    """
 
     cap: int
     gate_m: float
@@ -69,7 +81,7 @@ class Limits:
 
 @dataclass(slots=True, eq=False)
 class Course:
-    """How the iterations go: pose, robust scale, steps, and the sums and trace that `scan_matcher.verdict` judges.
+    """State of the iteration: pose, robust scale, steps, and the sums and trace for `scan_matcher.verdict`.
 
     ``share``: the scalar weight of T1 in the latest iteration; 0 with a matrix weight.
     """
@@ -86,14 +98,14 @@ class Course:
 
     @property
     def settled(self) -> bool:
-        """Whether it stands still."""
+        """Whether it has converged."""
         return bool(self.sums[icp.SETTLED])
 
 
 def reference_of(xy: Array, noise_m: float, lights: Array | None = None) -> Reference:
-    """Order a scan's points (n, 2), which stand in order of measurement about their lidar, on the axis (Eq. 10).
+    """Reference of a scan's points (n, 2), in order of measurement around their lidar, on the axis (Eq. 10).
 
-    ``lights``: (k, 2) light points in the same frame, which lie on the axis too and are no laser point's partner.
+    ``lights``: (k, 2) light points in the same frame, which lie on the axis too and are no lidar point's partner.
     """
     surfaces = np.empty((len(xy), 4))
     point_to_point_sums.surfaces(xy, noise_m, surfaces)
@@ -102,9 +114,9 @@ def reference_of(xy: Array, noise_m: float, lights: Array | None = None) -> Refe
 
 
 def register(new: New, reference: Reference, first: First, limits: Limits) -> tuple[Course, Array]:
-    """Sect. 4.2 until it stands still: where it has come to, and the laser's information of it in the same axes.
+    """Sect. 4.2 until convergence: the final state, and the lidar's information of its pose in the same axes.
 
-    ``first``: T1 in the reference lidar's frame, the start, and its information in T1's own axes.
+    ``first``: T1 in the reference lidar's frame, the start, with its information in T1's own axes.
     """
     course, fused = begin(new, first, limits), None
     T2, after, moments, W = course.T.copy(), np.empty(3), np.empty(9), np.zeros((3, 3))
@@ -131,7 +143,7 @@ def register(new: New, reference: Reference, first: First, limits: Limits) -> tu
 
 
 def begin(new: New, first: First, limits: Limits) -> Course:
-    """At T1; the robust scale is what its uncertainty moves a point."""
+    """Start at T1; the robust scale is the displacement of a point by its uncertainty."""
     lever = max(0.1, icp.mean_lever(new.points, new.T_base_lidar[:2]))
     L = first.L
     spread = math.sqrt(1.0 / L[0, 0] + 1.0 / L[1, 1] + lever * lever / L[2, 2])
@@ -148,8 +160,8 @@ def pair_up(new: New, reference: Reference, T: Array, gate: float, before: Fused
 def likelihoods(new: New, reference: Reference, first: First, T: Array) -> tuple[float, float]:
     """Logarithms of ``rho_1 p_1`` (Eq. 6, the light's links) and ``rho_2 p_2`` (Eq. 8-9, the beams) at the pose ``T``.
 
-    Light's deviations are those of its links, and how far the pose is from where they put it. Without a clear link
-    light has no weight at all: the paper's pause.
+    Light's deviations are the residuals of its links, and the distance of the pose from T1. Without a clear link light
+    has no weight: the paper's pause.
     """
     if not first.links:
         return -math.inf, 0.0
@@ -161,12 +173,12 @@ def likelihoods(new: New, reference: Reference, first: First, T: Array) -> tuple
 
 
 def advance(course: Course, after: Array, limits: Limits) -> None:
-    """Step towards ``after``; say whether it stands still.
+    """Step towards ``after`` and test for convergence.
 
-    A closed form step leaves a share of the way to go, the same each time, so that what remains can be told. The way is
-    reckoned along the surfaces' normals: along a bare corridor pairs creep for ever, and it means nothing. A step that
-    turns back on the one before is halved, since pairs may alternate between two sets. The robust scale shrinks no
-    faster than the steps do.
+    A closed-form step leaves a constant share of the remaining displacement, so the remainder can be estimated. The
+    displacement counts along the surfaces' normals. Along a bare corridor pairs creep without end, which does not
+    matter. A step that reverses the previous one is halved, since pairs may alternate between two sets. The robust
+    scale shrinks no faster than the steps do.
     """
     step, last = np.empty(3), course.scale == limits.scale_m
     twist_between(course.T, after, step)
@@ -186,9 +198,9 @@ def advance(course: Course, after: Array, limits: Limits) -> None:
 
 
 def along(sums: Array, step: Array) -> float:
-    """Root mean square way by which a step (x, y, yaw) moves the pairs along their normals, m; the step's own without.
+    """Root mean square displacement (m) of the pairs along their normals by a step (x, y, yaw).
 
-    ``sums``: of `point_to_point_sums.sum_up`.
+    ``sums``: of `point_to_point_sums.sum_up`. Without pairs it is the length of the step itself.
     """
     x, y, yaw = step[0], step[1], se2.wrap(float(step[2]))
     square = sums[0] * x * x + sums[3] * y * y + sums[5] * yaw * yaw
@@ -198,7 +210,7 @@ def along(sums: Array, step: Array) -> float:
 
 
 def note(course: Course, gate: float, sought: int) -> None:
-    """A row of the trace, in the layout of `icp`."""
+    """Append a row to the trace, in the layout of `icp`."""
     row = np.zeros(icp.TRACE)
     row[icp.AT_X : icp.AT_YAW + 1] = course.T
     row[icp.SCALE], row[icp.GATE], row[icp.STRIDE], row[icp.SOUGHT] = course.scale, gate, 1.0, sought
@@ -207,7 +219,7 @@ def note(course: Course, gate: float, sought: int) -> None:
 
 
 def information(new: New, reference: Reference, course: Course) -> Array:
-    """The laser's information at the solution, see `point_to_point_sums`; pose-centred in the reference's axes."""
+    """The lidar's information at the solution, see `point_to_point_sums`; pose-centred in the reference's axes."""
     A, B, g, d, H = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.zeros((3, 3))
     T, fused, gate = course.T.copy(), None, max(6.0 * course.scale, 0.1)
     for _ in range(PROBES):

@@ -1,12 +1,12 @@
-"""What the paper's matcher sums over its pairs: surfaces of the reference, Eq. 13 in closed form, and its information.
+"""Pair sums of the paper's point-to-point matcher: surface normals, Eq. 13 in closed form, and its information.
 
-The information is not Censi's formula, which trusts pairs that slide along a wall with the pose and so makes even a
-bare corridor look known (Bonnabel, Barczyk, Goulette, arXiv 1410.7632). Of a pair only the part along the surface's
-normal remains when it is sought anew at another pose. With ``A`` the normal equations of that part and ``B`` the
-covariance of their gradient, noise moves the solution by a covariance ``A^-1 B A^-1``. What is left is no noise: where
-the iteration stands still all forces balance, and pairs hold against the normals' gradient what they pull along the
-walls, because two scans do not hit a wall in the same places. By how much, ``d``, a few more steps along the normals
-show, and ``d d'`` is added; as they show it a little wrong, so is a part of its square in all directions.
+The information is not Censi's formula. That one keeps the pairs fixed, although they slide along a wall. So it makes
+even a bare corridor look known (Bonnabel, Barczyk, Goulette, arXiv 1410.7632). After a new search at another pose, only
+a pair's part along the surface normal remains. ``A`` are the normal equations of that part, ``B`` is the covariance of
+their gradient. Noise moves the solution by a covariance ``A^-1 B A^-1``. The rest is not noise. At convergence all
+forces balance. Pairs pull along the walls, because two scans do not hit a wall at the same points. That pull holds
+against the normals' gradient. A few more steps along the normals give the resulting error ``d``, and ``d d'`` is added.
+These steps are slightly wrong themselves, so a part of its square is added in all directions.
 """
 
 from __future__ import annotations
@@ -19,26 +19,29 @@ from estimator.numerics.symmetric3 import invert3, solve3
 from estimator.scan_matching import icp
 
 REACH_M, FEW = 0.12, 2
-"""A surface's direction comes from the neighbours within this, and from so many on either side at least."""
+"""Radius (m) of the neighbours that give a surface's direction, and fewest of them on either side."""
 
 VAGUE = 4.0
-"""Information of a pose known to 0.5 m (and rad): what a direction that nothing holds is divided by."""
+"""Information of a pose known to 0.5 m (and rad); it regularises directions without information."""
 
 ASIDE = 0.05
-"""Share of the squared displacement that is reckoned with in all directions."""
+"""Share of the squared displacement that is added in all directions."""
 
 SLOPE = 2
-"""Variance of its direction (rad^2): third column of a surface, behind its normal; (0, 0) where there is none."""
+"""Third column of a surface, behind its normal: variance of its direction, rad^2.
+
+The normal is (0, 0) without a surface.
+"""
 
 Pairs = tuple[Array, Array, Ints]
-"""Rows of the axis, surface of each row, and the row of each new point's partner, -1 where it has none."""
+"""Rows of the axis, surface of each row, and the row of each new point's partner, -1 for none."""
 
 
 @kernel("void(f8[:, ::1], f8, f8[:, ::1])")
 def surfaces(xy: Array, sigma: float, out: Array) -> None:
-    """Normal (x, y), variance of its direction (rad^2) and distance of the neighbours (m) for each point of a scan.
+    """Write the surface at each point of a scan: normal (x, y), direction variance (rad^2), neighbour distance (m).
 
-    Points (n, 2) stand in order of measurement. Where there is no line the normal is (0, 0).
+    Points (n, 2) are in order of measurement. Where there is no line the normal is (0, 0).
     """
     n = len(xy)
     for i in range(n):
@@ -67,7 +70,7 @@ def surfaces(xy: Array, sigma: float, out: Array) -> None:
 
 @kernel("void(f8[::1], f8, UniTuple(f8, 2), UniTuple(f8, 2))", inner=True)
 def add_pair(m: Array, w: float, q: tuple[float, float], p: tuple[float, float]) -> None:
-    """One pair more in the moments of :func:`closed_form`."""
+    """Add one pair to the moments of :func:`closed_form`."""
     m[0] += w
     m[1] += w * q[0]
     m[2] += w * q[1]
@@ -81,7 +84,7 @@ def add_pair(m: Array, w: float, q: tuple[float, float], p: tuple[float, float])
 
 @kernel("b1(f8[::1], f8[::1])")
 def closed_form(m: Array, T: Array) -> bool:
-    """Eq. 13 solved: the motion that brings the points q nearest to their partners p, in the least squares sense.
+    """Eq. 13 solved: the least-squares motion from the points q to their partners p, written to ``T``.
 
     ``m``: sum of weights, of ``w q`` (2), of ``w p`` (2), of ``w q_a p_b`` (xx, xy, yx, yy). False without a pair.
     """
@@ -99,7 +102,7 @@ def closed_form(m: Array, T: Array) -> bool:
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[::1])", inner=True)
 def align(q: Array, p: Array, T: Array) -> None:
-    """Eq. 13 for given pairs of points (n, 2): T that maps q onto p."""
+    """Eq. 13 for given pairs of points (n, 2): writes the T that maps q onto p."""
     m = np.zeros(9)
     for i in range(len(q)):
         add_pair(m, 1.0, (q[i, 0], q[i, 1]), (p[i, 0], p[i, 1]))
@@ -108,7 +111,7 @@ def align(q: Array, p: Array, T: Array) -> None:
 
 @kernel("void(f8[:, ::1], f8, UniTuple(f8, 2), UniTuple(f8, 2))", inner=True)
 def add_outer(A: Array, w: float, n: tuple[float, float], u: tuple[float, float]) -> None:
-    """Add ``w J J'``, where ``J = (n, n x u)`` is how a point at lever ``u`` moves along ``n`` with the pose."""
+    """Add ``w J J'`` with ``J = (n, n x u)``: displacement along ``n`` of a point at lever ``u`` by the pose."""
     turn = n[1] * u[0] - n[0] * u[1]
     A[0, 0] += w * n[0] * n[0]
     A[0, 1] += w * n[0] * n[1]
@@ -120,11 +123,11 @@ def add_outer(A: Array, w: float, n: tuple[float, float], u: tuple[float, float]
 
 @kernel("void(f8[:, ::1], Tuple((f8[:, ::1], f8[:, ::1], i8[::1])), f8[::1], f8, Tuple((f8[::1], f8[::1])))")
 def sum_up(points: Array, pairs: Pairs, T: Array, scale: float, out: tuple[Array, Array]) -> None:
-    """Step 2 of Sect. 4.2: moments of the weighted pairs for Eq. 13, and what the verdict wants to know of them.
+    """Step 2 of Sect. 4.2: moments of the weighted pairs for Eq. 13, and the sums for the acceptance test.
 
-    The weight is Cauchy's, with the spacing of the reference's points allowed for. ``out``: moments (9), and sums in
-    the layout of `icp` (how a motion moves the points along normals, squared; inliers, pairs, weights, squares along
-    the normal, of one scan's noise).
+    The weight is Cauchy's, with an allowance for the spacing of the reference's points. ``out``: moments (9), and sums
+    in the layout of `icp`. These are the normal equations along the normals, inliers, pairs and weights. The squares
+    along the normal are scaled to the noise of one scan.
     """
     m, sums = out
     rows, lines, partner = pairs
@@ -158,11 +161,11 @@ def sum_up(points: Array, pairs: Pairs, T: Array, scale: float, out: tuple[Array
 def along_normals(
     points: Array, pairs: Pairs, T: Array, noise: tuple[float, float], out: tuple[Array, Array, Array]
 ) -> None:
-    """What remains of the pairs when they are sought anew at every pose: their part along the surfaces' normals.
+    """Normal equations of the pairs' part along the surface normals, which a new search at another pose keeps.
 
     ``noise``: robust scale, range noise. ``out``: A (3, 3), the covariance B (3, 3) of its gradient, and the gradient
-    itself (3), pose-centred in the reference's axes. A direction that only the normals' noise seems to hold is left
-    out of A and of the gradient (`icp.trusted`).
+    (3); pose-centred, in the reference's axes. A direction with no more information than the normals' noise explains is
+    removed from A and from the gradient (`icp.trusted`).
     """
     rows, lines, partner = pairs
     c, s = np.cos(T[2]), np.sin(T[2])
@@ -201,7 +204,7 @@ def along_normals(
 
 @kernel("void(f8[:, ::1], f8[::1], f8, f8[::1])")
 def step_along(A: Array, g: Array, noise: float, d: Array) -> None:
-    """The step that :func:`along_normals` asks for, none where nothing holds."""
+    """Write the step of :func:`along_normals`, zero in directions without information."""
     M, b = np.empty((3, 3)), np.empty(3)
     for i in range(3):
         b[i] = -g[i]
@@ -212,7 +215,7 @@ def step_along(A: Array, g: Array, noise: float, d: Array) -> None:
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1])")
 def information(A: Array, B: Array, d: Array, H: Array) -> None:
-    """``(A^-1 (B + q A) A^-1 + d d')^-1`` with ``q = ASIDE d' A d``, written so that A may be singular."""
+    """Write ``(A^-1 (B + q A) A^-1 + d d')^-1`` with ``q = ASIDE d' A d``, in a form that allows a singular A."""
     M, u = np.empty((3, 3)), np.empty(3)
     aside = ASIDE * icp.between(d, A, d)
     for i in range(3):

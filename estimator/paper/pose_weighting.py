@@ -1,11 +1,11 @@
-"""Two estimates of one motion, weighted (Eq. 14-15) on the group of rigid motions.
+"""Weighted combination of the poses T1 and T2 (Eq. 14-15) on the group of rigid motions.
 
-Eq. 14 reads ``T_k = w T1 + (1 - w) T2``. A sum of two homogeneous matrices is no rigid motion. The same combination
-along the shortest way between the two is: ``T_k = T2 Exp(W Log(T2^-1 T1))``; ``W = 0`` is T2, ``W = 1`` is T1.
+Eq. 14 reads ``T_k = w T1 + (1 - w) T2``. A sum of two homogeneous matrices is no rigid motion. So the combination is
+taken along the geodesic between them: ``T_k = T2 Exp(W Log(T2^-1 T1))``; ``W = 0`` is T2, ``W = 1`` is T1.
 :class:`Weight` has two forms of W, after Eq. 15.
 
-T1 comes from wheels and lamps (`light_pose`), T2 from the lidar alone, and a `MatchResult` has the information of the
-lidar only. The daemon's matcher has the prediction as a prior inside its normal equations. Their solution is this
+T1 comes from odometry and lamps (`light_pose`), T2 from the lidar alone. A `MatchResult` contains the lidar's
+information only. The daemon's matcher has the prediction as a prior inside its normal equations. Their solution is this
 combination, with the matrix weight, to first order.
 """
 
@@ -21,7 +21,7 @@ from estimator.numerics.symmetric3 import invert3
 
 
 class Weight(Enum):
-    """How Eq. 15 weighs T1 against T2 in the paper's matcher."""
+    """Form of the weight of T1 against T2 (Eq. 15) in the paper's matcher."""
 
     INFORMATION = "matrix (L1 + L2)^-1 L1: each direction from the estimate that knows it"
     PAPER = "scalar ratio of the probabilities of both measurements at the present pose, in each iteration"
@@ -29,7 +29,7 @@ class Weight(Enum):
 
 @kernel("void(f8[::1], f8[::1], f8[::1])")
 def twist_between(A: Array, B: Array, out: Array) -> None:
-    """``Log(A^-1 B)``: the body twist (m, m, rad) that leads from pose A to pose B."""
+    """Write ``Log(A^-1 B)``: the body twist (m, m, rad) from pose A to pose B."""
     yaw = B[2] - A[2]
     yaw -= 2.0 * np.pi * np.floor(yaw / (2.0 * np.pi) + 0.5)
     c, s = np.cos(A[2]), np.sin(A[2])
@@ -42,7 +42,7 @@ def twist_between(A: Array, B: Array, out: Array) -> None:
 
 @kernel("void(f8[::1], f8[::1], f8[::1])")
 def moved(A: Array, twist: Array, out: Array) -> None:
-    """``A Exp(twist)``; ``out`` may be ``A``. Yaw is not wrapped."""
+    """Write ``A Exp(twist)``; ``out`` may be ``A``. Yaw is not wrapped."""
     w = twist[2]
     a = 1.0 - w * w / 6.0 if abs(w) < 1e-4 else np.sin(w) / w
     b = 0.5 * w if abs(w) < 1e-4 else (1.0 - np.cos(w)) / w
@@ -63,7 +63,7 @@ def combine(T1: Array, T2: Array, W: Array, out: Array) -> None:
 
 @kernel("void(f8[:, ::1], f8, f8[:, ::1])")
 def turned(L: Array, yaw: float, out: Array) -> None:
-    """``R' L R``: information (3, 3) in the axes of a frame that stands at ``yaw`` in the present one."""
+    """Write ``R' L R``: information (3, 3) in the axes of a frame that has yaw ``yaw`` in the present one."""
     c, s = np.cos(yaw), np.sin(yaw)
     x0, y0, x1, y1, x2, y2 = L[0, 0], L[0, 1], L[1, 0], L[1, 1], L[2, 0], L[2, 1]
     a0, b0 = c * x0 + s * y0, c * y0 - s * x0
@@ -88,9 +88,9 @@ def information_weight(L1: Array, L2: Array, W: Array) -> None:
 def paper_weight(log1: float, log2: float, W: Array) -> None:
     """Eq. 15 as a scalar: ``p1 / (p1 + p2)`` times the unit matrix, from the logarithms of ``rho_j p_j``.
 
-    The integrals of Eq. 15 cannot be meant as they stand: with ``p`` normalised they are constants. What is compared is
-    their integrand at the present pose. Both logarithms are means over the measurements of their kind, so that a
-    thousand beams do not outvote eight lamps by number alone, and ``rho_j`` makes them 0 for a perfect measurement.
+    The integrals of Eq. 15 cannot be taken literally: with ``p`` normalised they are constants. The comparison uses
+    their integrand at the present pose. Both logarithms are means over the measurements of their kind. So a thousand
+    beams do not outweigh eight lamps by number alone. ``rho_j`` makes them 0 for a perfect measurement.
     """
     d = min(max(log2 - log1, -700.0), 700.0)
     W[:] = 0.0

@@ -1,4 +1,4 @@
-"""The paper's matcher and its baseline as matchers for `Settings.match`: both match with the newest keyframe's scan."""
+"""The paper's point-to-point matcher and pIC as matchers for `Settings.match`, against the newest keyframe's scan."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from estimator.scan_matching.local_map import LocalMap, PlacedScan
 from estimator.scan_matching.scan_matcher import Attempt, MatchSettings, Prior, View
 
 FAR_M: Final = 80.0
-"""L of the quality filter where nothing else is given (`Settings.far_m`)."""
+"""L of the quality filter by default, m (`Settings.far_m`)."""
 SETTLED_M: Final = 2e-4
-"""Remaining way that ends the iteration: a fifth of what range noise leaves uncertain in a room."""
+"""Remaining displacement that ends the iteration, m: a fifth of the uncertainty by range noise in a room."""
 
 
 def points_of(frame: PlacedScan, far_m: float) -> Array:
@@ -41,9 +41,10 @@ class PointToPoint:
     """The paper's matcher (Sect. 4.2): point to point on the distance region, with T1 weighted in.
 
     Attributes:
-        far_m: L of the quality filter. weight: which form of Eq. 15.
-        first: gives T1 for a prediction and the reference keyframe; the prediction itself by default.
-        share: the scalar weight of T1 in the latest match, 0 to 1; 0 with a matrix weight.
+        far_m: L of the quality filter.
+        weight: form of Eq. 15.
+        first: returns T1 for a prediction and the reference keyframe; the prediction itself by default.
+        share: scalar weight of T1 in the latest match, 0 to 1; 0 with a matrix weight.
     """
 
     far_m: float = FAR_M
@@ -60,7 +61,7 @@ class PointToPoint:
         return scan_matcher.verdict(best, local, prior, settings)
 
     def attempt(self, view: View, frame: PlacedScan, first: First, cap: int, settings: MatchSettings) -> Attempt:
-        """Iterate from T1 until it stands still, see point_to_point.py."""
+        """Iterate from T1 until it converges, see point_to_point.py."""
         eye = frame.T_odom_lidar
         here = First(se2.between(eye, first.T), turned_back(first.L, first.T[2]), first.misfit, first.links)
         new = point_to_point.New(np.ascontiguousarray(view.points[:, :2]), view.T_base_lidar, view.beams, view.noise_m)
@@ -87,7 +88,7 @@ class Pic:
         return scan_matcher.verdict(self.attempt(view, local.newest, prior, cap), local, prior, settings)
 
     def attempt(self, view: View, frame: PlacedScan, prior: Prior, cap: int) -> Attempt:
-        """Iterate from the prediction until it stands still."""
+        """Iterate from the prediction until it converges."""
         axis = build_axis(points_of(frame, self.far_m), point_to_point.CENTRE)
         eye, mount = frame.T_odom_lidar, view.T_base_lidar
         T = se2.between(eye, prior.T)
@@ -106,6 +107,6 @@ def bearing_noise(bearing_rad: Array) -> float:
 
 
 def turned_back(L: Array, yaw: float) -> Array:
-    """Information in the axes of a frame that stands at ``yaw`` in the present one."""
+    """Information in the axes of a frame that has yaw ``yaw`` in the present one."""
     R = se2.rotation(yaw)
     return np.ascontiguousarray(R.T @ L @ R)

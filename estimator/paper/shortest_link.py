@@ -1,9 +1,9 @@
-"""The shortest-link mechanism (Sect. 2) on an epoch of the decoder: from links to a place, or to a pause.
+"""The shortest-link mechanism (Sect. 2): receiver position, or a pause of light, from the links of one epoch.
 
-    links -> lamps by code -> clear links S -> the Link_n shortest -> Eq. 3, 4 -> place of the receiver
+    links -> lamps by code -> clear links S -> the Link_n shortest -> Eq. 3, 4 -> position of the receiver
 
-A link is paused by itself where its lamp is not known, it is too faint, or too weak to have come straight (S leaves it
-out). Light as a whole is paused where fewer than Link_n links are clear: ``|S| < Link_n``.
+A single link is paused if its lamp is not known, or if it is too faint. It is also paused if it is too weak for a line
+of sight; it is then not in S. Light as a whole is paused where fewer than Link_n links are clear: ``|S| < Link_n``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from estimator.paper.lateration_model import Links, Received, SolverSettings, us
 from estimator.result import Link, LinkState
 
 FAINT: Final = 5.0
-"""A link is faint below this many deviations of its noise."""
+"""Ratio of RSS to its noise sigma below which a link is faint."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,12 +39,13 @@ class Heard:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Selection:
-    """What an epoch gives.
+    """Result of the selection in one epoch.
 
     Attributes:
-        heard: every link, the strongest first. clear: S, as indices in ``heard``, the shortest link first.
-        used: the Link_n shortest of S as the solvers take them; None where light is paused.
-        place: of the receiver by Eq. 3, 4; None where light is paused or the lamps leave it open.
+        heard: every link, the strongest first.
+        clear: S, as indices in ``heard``, the shortest link first.
+        used: the Link_n shortest of S as input of the solvers; None where light is paused.
+        place: position of the receiver by Eq. 3, 4; None where light is paused or the lamps leave it ambiguous.
     """
 
     heard: tuple[Heard, ...]
@@ -54,7 +55,7 @@ class Selection:
 
     @property
     def accepted(self) -> frozenset[int]:
-        """Numbers of the lamps whose links the place comes from; empty without a place."""
+        """Numbers of the lamps whose links determine the position; empty without a position."""
         if self.used is None or self.place is None:
             return frozenset()
         lamps = (self.heard[self.clear[i]].lamp for i in range(len(self.used.d)))
@@ -67,14 +68,14 @@ PAUSED: Final = Selection((), ())
 def select(
     epoch: LightEpoch, catalogue: Catalogue, survey: Survey, settings: SolverSettings, prior: Prior | None
 ) -> Selection:
-    """The place that the Link_n shortest links of an epoch give.
+    """Position by the Link_n shortest links of an epoch.
 
     Args:
         epoch: from the decoder.
-        catalogue: the lamps; those that describe themselves in this epoch are added.
+        catalogue: the lamps; those that send their own data in this epoch are added.
         survey: receiver and depth.
         settings: solver and Link_n.
-        prior: the receiver's place beforehand, to tell lamps of one code and mirror images apart; None: not known.
+        prior: prior position of the receiver, to separate lamps of one code and mirror images; None: not known.
     """
     if epoch.block & UNUSABLE:
         return PAUSED
@@ -114,12 +115,12 @@ def heard(epoch: LightEpoch, k: int, catalogue: Catalogue, prior: Prior | None) 
 
 
 def nearest(lamps: list[Lamp], xy: Array) -> Lamp:
-    """The lamp nearest to a place."""
+    """The lamp nearest to a position."""
     return min(lamps, key=lambda lamp: math.hypot(lamp.x - float(xy[0]), lamp.y - float(xy[1])))
 
 
 def links_of(selection: Selection, settings: SolverSettings, xy: Array | None) -> tuple[Link, ...]:
-    """The links as results, the strongest first; residuals against the receiver's place ``xy`` (None: not known)."""
+    """The links as results, strongest first; residuals for the receiver at ``xy`` (None: not known)."""
     used = set() if selection.place is None or selection.used is None else set(selection.clear[: len(selection.used.d)])
     residuals = dict[int, tuple[float, float]]()
     if xy is not None and selection.used is not None:

@@ -1,1 +1,1 @@
-"""Where in the stored map the robot is, while that is in doubt."""
+"""Relocalisation, kidnap detection and pose hypotheses: the robot's pose in a stored map without a prediction."""

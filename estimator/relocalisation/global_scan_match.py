@@ -1,11 +1,10 @@
-"""Where in the whole map a keyframe fits, without any idea of the pose: everywhere, or where light or a person says.
+"""Global scan match: poses of a keyframe in the whole map without a prediction, or in given search windows.
 
-The scan is searched for by branch and bound in one field of all settled submaps; each place that comes out is matched
-against the submaps that lie there and judged as a loop is: by the share of the beams that fit, by what speaks against
-it, by rank and by residual. A place that has been found before is only matched again where odometry says that the
-robot must be by now. What the answers come to over several keyframes is decided elsewhere (`relocalisation`).
+Branch and bound searches the scan in one likelihood field of all finished submaps. Each hit is matched against the
+submaps around it and judged like a loop: by inlier share, free-space violation, rank and residual. A pose found before
+is only matched again where odometry predicts it now. `relocalisation` combines the results of several keyframes.
 
-All of this is work for the background job; nothing here reads or changes a state.
+All of this runs in a background job; nothing here reads or changes the state.
 """
 
 from __future__ import annotations
@@ -31,33 +30,36 @@ from estimator.scan_matching.local_map import LocalMap, contradicted
 from estimator.scan_matching.scan_matcher import MatchSettings, Prior, View, match
 
 CELL_M, BLUR, CELLS = 0.1, 0.7, 6e6
-"""Resolution of the field, its deviation in cells, and how many cells it may have before it is made coarser."""
+"""Resolution of the field (m), its sigma in cells, and most cells before the resolution becomes coarser."""
 
 HITS, NODES, POINTS = 24, 4_000_000, 120
-"""Of the search: places at most, nodes at most, points of the scan."""
+"""Limits of the search: hits, nodes, points of the scan."""
 
 LEAST, RATIO = 0.45, 0.75
-"""Least score of a place, and least share of the best one's. A scan scores 0.9 to 1 where it was taken (random places
-of a simulated office); what people and moved furniture hide is left room for."""
+"""Smallest score of a hit, and smallest share of the best one's score.
+
+A scan scores 0.9 to 1 at its own pose (random poses in a simulated office). The rest allows for people and moved
+furniture.
+"""
 
 AROUND, NEAR_M = 6, 10.0
-"""Submaps that a place is matched with: so many at most, and the nearest, and none farther than that but one."""
+"""Most submaps matched at a hit, nearest first, and their largest distance (m); one is always used."""
 
 WITNESSES: Final = 3
-"""Of these, so many are asked whether they have looked through where the scan has points."""
+"""Number of these whose reference scan takes part in the free-space test."""
 
 GUESS: Final = np.diag((0.3**-2, 0.3**-2, 0.1**-2))
-"""Information with which a match starts."""
+"""Initial information of a match."""
 
 SAME_M, SAME_RAD = 0.4, 0.2
-"""Two places nearer than this are one; a match that ends farther from where it began has found another place."""
+"""Distance (m, rad) of one and the same pose; a match that ends farther from its start has found another one."""
 
 POSSIBLE: Final = 0.15
-"""Share of the evidence that may speak against a place before it is ruled out; a loop has to be surer."""
+"""Free-space violation above which a pose is excluded; a loop has a stricter threshold."""
 
 
 class Verdict(Enum):
-    """What a keyframe says of a place."""
+    """Result of a keyframe at a pose."""
 
     HOLDS = "it fits as a loop does"
     OPEN = "nothing rules it out"
@@ -66,7 +68,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """A settled submap and where it lies."""
+    """A finished submap with its pose."""
 
     key: int
     T_map_submap: Array
@@ -75,7 +77,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terrain:
-    """All that is settled, to be searched; ``field`` in the map's frame."""
+    """The search map: all finished submaps; ``field`` in the map frame."""
 
     pieces: tuple[Piece, ...]
     field: Field
@@ -83,11 +85,14 @@ class Terrain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """How a keyframe fits at a place.
+    """Match of a keyframe at a pose.
 
     Attributes:
-        T_map_keyframe: the place as matched. P: covariance, 3x3, axes of the map. share, against, residual_m: how well,
-        as of `loop_verification.Found`. key: submap nearest to it, and the place in that one.
+        T_map_keyframe: the matched pose.
+        P: covariance, 3x3, axes of the map.
+        share, against, residual_m: quality, as of `loop_verification.Found`.
+        key, T_submap_keyframe: nearest submap, and the pose in its frame.
+        verdict: result.
     """
 
     T_map_keyframe: Array
@@ -102,16 +107,21 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Query:
-    """What a look is asked.
+    """Input of a search.
 
     Attributes:
-        frame: keyframe to look for. pieces: where. before: terrain of an earlier look.
-        guesses: where it should be by what was found earlier: T_map_keyframe each.
-        past: earlier keyframes, of which a new place has to be true as well unless something else says so (`outvoted`):
-            they may have been taken in somebody's hands.
-        search: whether new places are searched for. windows: where; everywhere if None. nodes: most that are opened.
-        outvoted: whether something else says that the robot is in the windows, or at the guesses; see `fit`.
-        firm: of each guess whether earlier looks do, from places far enough apart; none are if it is empty.
+        frame: keyframe to search.
+        pieces: submaps to search in.
+        before: search map of an earlier search.
+        guesses: expected pose T_map_keyframe of each hypothesis.
+        past: earlier keyframes that a new pose has to fit as well, unless another sensor confirms it (`outvoted`): they
+            may date from before the robot was put down.
+        search: whether to search new poses.
+        windows: search windows; everywhere if None.
+        nodes: most nodes opened.
+        outvoted: whether another source places the robot in the windows, or at the guesses; see `fit`.
+        firm: for each guess whether earlier searches confirm it, from positions far enough apart; none do if it is
+            empty.
     """
 
     frame: Keyframe
@@ -128,12 +138,14 @@ class Query:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Looked:
-    """What a look has found.
+    """Result of a search.
 
     Attributes:
-        terrain: for the next one. guesses: a fit for each guess. fresh: further places, each with its fits in the past.
-        complete: no place was left out: neither the cap on nodes nor that on places ended the search; None: there was
-            none.
+        terrain: search map for the next one.
+        guesses: a fit for each guess.
+        fresh: further poses, each with its fits in the past.
+        complete: neither the cap on nodes nor that on hits ended the search; None: there was no search.
+        nodes: number of nodes opened.
     """
 
     terrain: Terrain
@@ -144,7 +156,7 @@ class Looked:
 
 
 def look(query: Query, settings: LoopSettings) -> Looked:
-    """Look for a keyframe in the whole map."""
+    """Search a keyframe in the whole map."""
     terrain = terrain_of(query.pieces, query.before)
     view = view_of(query.frame, settings)
     firm = query.firm or (False,) * len(query.guesses)
@@ -173,7 +185,7 @@ def look(query: Query, settings: LoopSettings) -> Looked:
 
 
 def terrain_of(pieces: tuple[Piece, ...], before: Terrain | None) -> Terrain:
-    """The terrain of these submaps; the same one as before where nothing has come, gone or moved."""
+    """Search map of these submaps; the earlier one where no submap was added, removed or moved."""
     if before is not None and len(before.pieces) == len(pieces):
         pairs = zip(before.pieces, pieces, strict=True)
         if all(a.settled is b.settled and np.array_equal(a.T_map_submap, b.T_map_submap) for a, b in pairs):
@@ -185,7 +197,7 @@ def terrain_of(pieces: tuple[Piece, ...], before: Terrain | None) -> Terrain:
 
 
 def placed(piece: Piece) -> Array:
-    """The elements of a submap in the map's frame."""
+    """The elements of a submap in the map frame."""
     elements = piece.settled.elements.astype(np.float64)
     R = se2.rotation(piece.T_map_submap[2])[:2, :2]
     elements[:, :2] = se2.apply(piece.T_map_submap, elements[:, :2])
@@ -194,7 +206,7 @@ def placed(piece: Piece) -> Array:
 
 
 def view_of(frame: Keyframe, settings: LoopSettings) -> View | None:
-    """A keyframe as something to match; None where it has seen too little."""
+    """A keyframe as match input; None with too few points."""
     points = points_of_frame(frame, 0.01)
     if len(points.xy) < MatchSettings().min_points:
         return None
@@ -202,7 +214,7 @@ def view_of(frame: Keyframe, settings: LoopSettings) -> View | None:
 
 
 def searched(query: Query, terrain: Terrain, view: View) -> tuple[list[Array], bool, int]:
-    """Places (T_map_keyframe) where the scan fits best, whether they are all there are, nodes opened."""
+    """Poses (T_map_keyframe) where the scan fits best, whether they are complete, and the nodes opened."""
     frame = query.frame
     lidar_base = se2.inverse(frame.T_base_lidar)
     seen = se2.apply(lidar_base, points_of_frame(frame, view.noise_m).xy)
@@ -219,16 +231,16 @@ def searched(query: Query, terrain: Terrain, view: View) -> tuple[list[Array], b
 
 
 def same(T: Array, other: Array) -> bool:
-    """Whether two places are one."""
+    """Whether two poses are one."""
     x, y, yaw = se2.between(T, other).tolist()
     return math.hypot(x, y) < SAME_M and abs(yaw) < SAME_RAD
 
 
 def fit(view: View | None, terrain: Terrain, T: Array, settings: LoopSettings, outvoted: bool = False) -> Fit:
-    """Match a scan at a place of the map, and judge it.
+    """Match a scan at a pose of the map, and judge it.
 
-    ``outvoted``: something else says that it is here or nearby (light, a person, earlier looks). Then a single witness
-    that has looked through where the scan has points does not rule the place out: a door that stood open then is shut.
+    ``outvoted``: another source supports this pose (light, an operator, earlier searches). Then a single reference scan
+    with free-space violation does not exclude it: a door that was open then is shut now.
     """
     near = nearest(terrain, T)
     piece = terrain.pieces[near[0]]
@@ -249,7 +261,7 @@ def fit(view: View | None, terrain: Terrain, T: Array, settings: LoopSettings, o
 
 
 def judged(result: MatchResult, share: float, against: float, settings: LoopSettings) -> Verdict:
-    """What a match says of its place."""
+    """Verdict of a match on its pose."""
     if against > POSSIBLE:
         return Verdict.NO
     sure = result.ok and share >= settings.share and against <= settings.against and result.residual_m <= settings.sse_m
@@ -257,19 +269,19 @@ def judged(result: MatchResult, share: float, against: float, settings: LoopSett
 
 
 def nearest(terrain: Terrain, T: Array) -> list[int]:
-    """Numbers of the pieces that lie about a place, nearest first; at least one."""
+    """Indices of the submaps around a pose, nearest first; at least one."""
     away = [math.hypot(*(piece.T_map_submap[:2] - T[:2]).tolist()) for piece in terrain.pieces]
     order = sorted(range(len(away)), key=lambda k: (away[k], k))
     return [k for n, k in enumerate(order[:AROUND]) if n == 0 or away[k] < NEAR_M]
 
 
 def local_of(terrain: Terrain, near: Sequence[int], T: Array) -> LocalMap:
-    """The pieces as one map to match against, in the map's frame."""
+    """The submaps as one local map, in the map frame."""
     return local_map.index(np.vstack([placed(terrain.pieces[k]) for k in near]), T[:2], 1, None)
 
 
 def worst(terrain: Terrain, near: Sequence[int], local: LocalMap, T: Array, view: View) -> tuple[float, float]:
-    """The two largest shares of the evidence against a place that the map or one of its witnesses knows of."""
+    """The largest and second largest free-space violation among the map and its reference scans."""
     eye = se2.compose(T, view.T_base_lidar)
     shares = [0.0, contradicted(local, eye, view.beams, view.noise_m)]
     for k in near[:WITNESSES]:

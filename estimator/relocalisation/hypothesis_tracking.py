@@ -1,9 +1,8 @@
-"""Hypotheses of the pose during relocalisation: found by searches of the map, predicted by odometry, ruled out.
+"""Pose hypotheses during relocalisation: found by searches of the map, predicted by odometry, confirmed or rejected.
 
-A place is a hypothesis of where the odom frame lies. Every look at a later keyframe tests each of them where odometry
-says that the robot must be by now; a place that is found later has to be true of the earlier keyframes too. The laser
-alone has decided when one place is left over, of all that a complete search has offered, and has held from places far
-enough apart. It never has while two are left.
+A hypothesis is a pose of the odom frame. Every later keyframe tests each hypothesis where odometry predicts it. A new
+pose has to fit the earlier keyframes too. The lidar alone decides when one hypothesis of a complete search is left. It
+must be confirmed from positions far enough apart. It never decides while two are left.
 """
 
 from __future__ import annotations
@@ -23,50 +22,54 @@ from estimator.relocalisation.scene_change import Leap
 from estimator.scan_matching.branch_and_bound import Around
 
 HELD, HELD_M = 3, 1.0
-"""So many looks, from places so far apart, have to hold a place before the laser alone is believed."""
+"""Confirmations required of the lidar alone, and distance (m) between their positions."""
 
 PAST, PAST_M = 4, 0.6
-"""Earlier keyframes that a new place has to be true of, and how far apart they are."""
+"""Number of earlier keyframes that a new pose has to fit, and their distance (m)."""
 
 IDLE: Final = 8
-"""Looks in a row that may leave a place open; one that holds comes back with the next search."""
+"""Most consecutive searches without confirmation; a true pose returns with the next search."""
 
 WATCH_M: Final = 20.0
-"""Way for which a place is watched once it was found."""
+"""Path length (m) of the trial after acceptance."""
 
 MOST: Final = 32
-"""Hypotheses carried at most."""
+"""Most hypotheses."""
 
 BEHIND: Final = 0.15
-"""By how much the worth of a place that was never held must be less than that of the one that was, to be no rival."""
+"""Smallest lead of the confirmed hypothesis over an unconfirmed one, in score, so that the latter does not compete."""
 
 NEARLY, NEARLY_M, NEARLY_RAD = 0.75, 0.1, 0.03
-"""Share of the beams, and deviations, of a place that another witness may confirm though no look has held it."""
+"""Inlier share and sigma (m, rad) at which another sensor may confirm an unconfirmed pose."""
 
 STEADY, HALF = 3, 0.5
-"""So many looks have to have found it in the same place, with this share, where less of the beams fit."""
+"""Searches with the same pose, and the smaller inlier share that then suffices."""
 
 LOST: Final = 2
-"""Looks in a row that lost a place while they held another one: it is no rival of that one any more."""
+"""Consecutive searches that lost a pose while they confirmed another one; it then no longer competes."""
 
 MOVED_M, MOVED_RAD = 1.0, 0.5
-"""A robot that is farther from where it was remembered has been moved: more than it rolls on once it is not steered."""
+"""Distance (m, rad) from the stored pose above which the robot has been moved: it rolls on by less when unsteered."""
 
 AGAIN_M, AGAIN_RAD = 1.0, 1.0
-"""Way or turn after which it is searched again."""
+"""Path length (m) or rotation (rad) between two searches of the map."""
 
 SOONER: Final = 0.45
-"""Part of that where nothing has been found yet, or too much."""
+"""Factor on these while no pose, or too many, have been found."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """A place that nothing has ruled out.
+    """A pose that is not excluded.
 
     Attributes:
-        T_map_odom: where the odom frame then lies, by the latest look that held it. held: those looks, oldest first.
-        looks: at it so far; idle: how many of them in a row have left it open. share: mean share of the beams.
-        latest: the latest look, whatever it said. holds: how many looks held it.
+        T_map_odom: pose of the odom frame, by the latest search that confirmed it.
+        held: those searches, oldest first.
+        looks: number of searches so far.
+        idle: number of latest consecutive ones without confirmation.
+        share: mean inlier share.
+        latest: the latest search, with any result.
+        holds: number of confirmations.
     """
 
     T_map_odom: Array
@@ -78,7 +81,7 @@ class Hypothesis:
     holds: int = 0
 
     def after(self, frame: Keyframe, fit: Fit) -> Hypothesis:
-        """The hypothesis after one look more."""
+        """The hypothesis after one more search."""
         share = (self.share * self.looks + fit.share) / (self.looks + 1)
         if fit.verdict is not Verdict.HOLDS:
             return replace(self, looks=self.looks + 1, idle=self.idle + 1, share=share, latest=(frame, fit))
@@ -86,31 +89,36 @@ class Hypothesis:
         return Hypothesis(carried(frame, fit), held, self.looks + 1, 0, share, (frame, fit), self.holds + 1)
 
     def worth(self) -> float:
-        """The share of the beams that fit, less that of the evidence which spoke against it at the latest look."""
+        """Score: mean inlier share, less the free-space violation in the latest search."""
         return self.share - (0.0 if self.latest is None else self.latest[1].against)
 
     def apart(self) -> float:
-        """Metres between the places it was held from."""
+        """Distance (m) between the positions of its confirmations."""
         at = np.array([frame.T_odom_keyframe[:2] for frame, _ in self.held]).reshape(-1, 2)
         return float(np.hypot(*np.ptp(at, axis=0))) if len(at) else 0.0
 
     def firm(self) -> bool:
-        """Whether enough looks have held it, from places far enough apart."""
+        """Whether it has enough confirmations, from positions far enough apart."""
         return len(self.held) >= HELD and self.apart() >= HELD_M
 
 
 @dataclass(slots=True, eq=False)
 class Seek:
-    """What has been found since the robot is being relocalised.
+    """The hypothesis set of a relocalisation.
 
     Attributes:
-        alive: places left. past: some earlier keyframes that were looked for. complete: the latest search was; then
-            nothing but ``alive`` is left. searched: where that was (odom frame). terrain: of the latest look.
-        looks: so far. hint: T_map_odom by a person who has said where the robot is, and
-            how many looks have not found it there. lit: keyframe of the latest look. around: light's windows where it
-            was searched.
-        t_begin: instant of the first keyframe. way_begin: way driven when light was first good.
-        remembered: T_map_odom if the robot has not been moved since the run before; None: nobody knows.
+        alive: remaining hypotheses.
+        past: some earlier keyframes that were searched.
+        complete: whether the latest search was complete; then no pose outside ``alive`` is possible.
+        searched: its position (odom frame).
+        terrain: search map of the latest search.
+        looks: number of searches so far.
+        hint: T_map_odom of an operator pose, and the number of searches without a match there.
+        lit: ID of the keyframe of the latest search.
+        around: light's windows in it.
+        t_begin: instant of the first keyframe.
+        way_begin: path length when light was first valid, m.
+        remembered: T_map_odom of the stored pose, if the robot has not been moved since; None: not available.
     """
 
     alive: tuple[Hypothesis, ...] = ()
@@ -127,7 +135,7 @@ class Seek:
     remembered: Array | None = None
 
     def due(self, frame: Keyframe) -> bool:
-        """Whether a keyframe is to be searched for, and not only looked at where it should be."""
+        """Whether a keyframe needs a search of the map, beyond tests of the hypotheses."""
         if self.searched is None:
             return True
         x, y, yaw = se2.between(self.searched, frame.T_odom_keyframe).tolist()
@@ -135,13 +143,13 @@ class Seek:
         return math.hypot(x, y) > part * AGAIN_M or abs(yaw) > part * AGAIN_RAD
 
     def elsewhere(self, around: tuple[Around, ...]) -> bool:
-        """Whether light's windows are others than those that were searched."""
+        """Whether light's windows differ from those that were searched."""
         if len(around) != len(self.around):
             return True
         return not all(any(within(one, other) for other in self.around) for one in around)
 
     def take(self, frame: Keyframe, asked: tuple[Hypothesis, ...], looked: Looked) -> None:
-        """Take in a look at ``frame``, which was asked for the hypotheses ``asked``."""
+        """Apply the result of a search for ``frame``, which tested the hypotheses ``asked``."""
         fits = zip(asked, looked.guesses, strict=True)
         alive = [one.after(frame, fit) for one, fit in fits if fit.verdict is not Verdict.NO]
         for fit, earlier in looked.fresh:
@@ -158,7 +166,7 @@ class Seek:
             self.past = (*self.past, frame)[-PAST:]
 
     def favourite(self) -> Hypothesis | None:
-        """The only place that a look has held, or nearly, if there is one and all others are well behind it."""
+        """The only hypothesis with a confirmation, or nearly one, if all others have clearly lower scores."""
         held = [one for one in self.alive if one.held]
         held = [one for one in held if not outdone(one, held)]
         if len(held) > 1 or not self.alive:
@@ -170,9 +178,9 @@ class Seek:
         return best if held and not best.idle else nearly(best)
 
     def sure(self, one: Hypothesis, witnessed: bool) -> bool:
-        """Whether a place is the robot's; ``witnessed``: something else than the laser says so.
+        """Whether to accept a hypothesis; ``witnessed``: another sensor or the operator confirms it.
 
-        The laser alone is believed only where nothing else is left.
+        The lidar alone decides only where no other hypothesis is left.
         """
         if not self.complete or one.idle:
             return False
@@ -180,10 +188,10 @@ class Seek:
         return witnessed or (len(self.alive) == 1 and most and one.firm())
 
     def recalled(self) -> Hypothesis | None:
-        """The place where the robot stood last, if the laser holds it, and no other one in the whole map.
+        """The hypothesis at the stored pose, if the lidar confirms it, and no other one in the whole map.
 
-        Neither is enough by itself: a robot that was carried off may stand where it looks alike, and of two places
-        that fit the remembered one may be the wrong one.
+        Neither suffices by itself. A kidnapped robot may be where the surroundings look alike. Of two poses that fit,
+        the stored one may be wrong.
         """
         here = [one for one in self.alive if self.remembered is not None and near(self.remembered, one.T_map_odom)]
         if len(here) != 1 or not self.complete or not here[0].held or here[0].idle:
@@ -193,26 +201,26 @@ class Seek:
 
 
 def within(one: Around, other: Around) -> bool:
-    """Whether the middle of a window lies in another one."""
+    """Whether the centre of a window lies in another one."""
     x, y, _ = (one.T_map_lidar - other.T_map_lidar).tolist()
     return math.hypot(x, y) < other.reach_m
 
 
 def near(remembered: Array, T_map_odom: Array) -> bool:
-    """Whether a robot that is found there may have been left where it is remembered."""
+    """Whether a robot at a pose may have stayed at the stored pose."""
     x, y, yaw = se2.between(remembered, T_map_odom).tolist()
     return math.hypot(x, y) < MOVED_M and abs(yaw) < MOVED_RAD
 
 
 def outdone(one: Hypothesis, held: list[Hypothesis]) -> bool:
-    """Whether looks have lost a place that they once held while they went on holding another one, and surely."""
+    """Whether searches no longer confirm a hypothesis while they still confirm another one often enough."""
     return one.idle >= LOST and any(not other.idle and other.holds >= HELD for other in held if other is not one)
 
 
 def nearly(one: Hypothesis) -> Hypothesis | None:
-    """A place that no look has held, as if the latest had, where only what has changed since spoke against it.
+    """An unconfirmed hypothesis as if confirmed, where only recent changes contradict it; else None.
 
-    Somebody who stands about leaves most of the beams; where furniture was moved, look after look has to fit there.
+    A person beside the robot leaves most of the beams. Where furniture was moved, search after search has to fit there.
     """
     if one.latest is None:
         return None
@@ -229,11 +237,12 @@ def nearly(one: Hypothesis) -> Hypothesis | None:
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Watch(Trial):
-    """A place that was found is confirmed, or refuted, by looks while the robot drives on.
+    """Trial of an accepted pose: later keyframes confirm or reject it while the robot drives on.
 
     Attributes:
-        until_m: way until which it is watched, m. strikes: looks that have spoken against it since one held it.
-        terrain: of the latest look.
+        until_m: path length at its end, m.
+        strikes: rejections since the last confirmation.
+        terrain: search map of the latest check.
     """
 
     until_m: float
@@ -243,18 +252,20 @@ class Watch(Trial):
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class SearchedAside(SetAside):
-    """A stored map that is set aside while the robot is looked for in it; ``search``: so far."""
+    """An unaligned map with the hypothesis set of the search in it, ``search``."""
 
     search: Seek
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Question:
-    """What a look is to decide: whether the robot was carried off.
+    """Question of a kidnap search.
 
     Attributes:
-        jumped: the pose did. holds: the place does, in the local map. again: an earlier search had to be ended.
-        leapt: what is seen did.
+        jumped: whether the pose jumped.
+        holds: whether the pose is confirmed in the local map.
+        again: whether an earlier search ended at its cap.
+        leapt: whether the scene changed.
     """
 
     jumped: bool
@@ -265,24 +276,29 @@ class Question:
 
 @dataclass(slots=True, eq=False)
 class Suspicion:
-    """What is remembered from scan to scan of whether the robot was carried off (`kidnap_detection`).
+    """State of kidnap detection (`kidnap_detection`).
 
     Attributes:
-        fitted: scans that have fitted since something else raised the suspicion, 0: nothing has. jumped: the pose did.
-        odd: a match has moved it by more than the prediction allowed. share: of the beams that fits usually.
-        t_still: since when the wheels stand, as far as they have told since the last match; moved: by what they have
-            turned meanwhile (x, y, yaw). unwatched_s: the longest time since that match for which they stood, and
-            turned then.
-        t_rest: since when the wheels stand, whether matches come or not; rested: by what they have turned meanwhile.
-        through: share of what should be in view that was looked through when they stopped, negative before the first
-            scan; gone: how far they have turned since then. strange_s: for so long more of it has been since;
-            t_strange: when it last was.
+        fitted: number of scans that have matched since the trigger, 0: no trigger.
+        jumped: whether the pose jumped.
+        odd: whether a match has moved it by more than the prediction allows.
+        share: usual inlier share.
+        t_still, moved: begin of the wheels' rest, by the readings since the last match, and their motion since (x, y,
+            yaw).
+        unwatched_s: longest rest since that match that ended with motion.
+        t_rest, rested: begin of the wheels' rest, with or without matches, and their motion since.
+        through: share seen through when they stopped, negative before the first scan.
+        gone: motion of the wheels since then.
+        strange_s: total duration of a larger share since.
+        t_strange: latest instant of it.
         period_s: usual time between two matches, 0 before it is known.
-        question: what the look under way decides, None: there is none. t_asked: when it was asked for.
-        again: the next one may search more.
-        since: ID of the first keyframe that may be of another place, 0: none.
-        leap: what is remembered of the latest scans. t_leap: instant of one that nobody has judged yet. leapt: what is
-            seen has changed all at once.
+        question: question of the running search, None: there is none.
+        t_asked: instant of its start.
+        again: whether the next one may open more nodes.
+        since: ID of the first keyframe that may be of another position, 0: none.
+        leap: state of the scene change detection.
+        t_leap: instant of a scene change that has not been judged yet.
+        leapt: whether the scene has changed.
     """
 
     fitted: int = 0
@@ -308,18 +324,18 @@ class Suspicion:
     leapt: bool = False
 
     def end(self) -> None:
-        """Suspect nothing, and wait for no answer."""
+        """Clear the trigger and abandon the search."""
         self.leapt = False
         self.fitted, self.jumped, self.odd, self.question, self.again, self.since = 0, False, False, None, False, 0
 
 
 def carried(frame: Keyframe, fit: Fit) -> Array:
-    """``T_map_odom`` that puts a keyframe where it was found."""
+    """``T_map_odom`` that puts a keyframe at its matched pose."""
     return se2.compose(fit.T_map_keyframe, se2.inverse(frame.T_odom_keyframe))
 
 
 def distinct(found: list[Hypothesis], frame: Keyframe) -> list[Hypothesis]:
-    """Of those that put the robot into the same place the one that was held most."""
+    """Of hypotheses with the same robot pose, the one with the most confirmations."""
     kept: list[Hypothesis] = []
     for one in sorted(found, key=lambda one: (-len(one.held), -one.share)):
         T = se2.compose(one.T_map_odom, frame.T_odom_keyframe)

@@ -1,18 +1,19 @@
-"""Whether the robot may have been carried off though scans fit again: then its place has to stand a search of the map.
+"""Kidnap detection: signs that the robot was lifted and carried although scans match, and the deciding map search.
 
-The laser follows the robot from scan to scan, and where the surroundings repeat it follows it into the wrong place. It
-is suspected where physics says that something else than driving has happened:
+The lidar tracks the robot from scan to scan, and in repeating surroundings it tracks the wrong pose. Kidnapping is
+possible where something other than driving has happened:
 
-* a match moves the pose farther than any driving can have in that time;
-* the robot stood unwatched (no scan told anything, and no wheel turned), or nothing fitted for a while, and what is
-  seen afterwards is not what was seen before;
-* what is seen changes from one scan to the next, all at once (`scene_change`);
-* the wheels stand, and for a while much of the map is looked through that should be in view (`was_strange`).
+* A match moves the pose farther than any driving can in that time.
+* The robot was at rest without data (no match, and no wheel turned), or no scan matched for a while. What it sees
+  afterwards differs from before.
+* The scene changes from one scan to the next (`scene_change`).
+* The wheels are at rest, and for a while scans see through much of the map around (`was_strange`).
 
-One look in the whole map then decides: if another place fits nearly as well the robot is being relocalised, and after a
-leap also if its own is ruled out and another fits. So it is after a jump where the place does not hold, there or in the
-local map; all else may have been a door, a table that was carried away, or somebody who sat and left. Until the answer
-has come nothing is laid into the map. While light tells the place light is the witness, see `relocalisation.doubt`.
+One search of the whole map then decides. If another pose fits nearly as well, relocalisation starts. After a scene
+change it also starts if the pose itself is excluded and another one fits. After a jump it also starts where the pose is
+not confirmed, there or in the local map. All other causes may be a door, a table that was carried away, or a person who
+has left. Until the result arrives no keyframe is created. While light gives the pose, light decides instead, see
+`relocalisation.doubt`.
 """
 
 from __future__ import annotations
@@ -44,44 +45,55 @@ from estimator.scan_matching import local_map
 from estimator.scan_matching.deskew import ScanPoints, unturned
 
 SURPRISE: Final = 25.0
-"""Squared Mahalanobis distance of a correction that no driving explains; as that of `scan_matcher.demand_on`."""
+"""Squared Mahalanobis distance of a correction that no driving explains; as in `scan_matcher.demand_on`."""
 ROW: Final = 3
-"""Scans in a row that do not fit, and then do; so many more, before the place is looked for: the first that fits may be
-of two places, or blurred."""
+"""Consecutive scans that do not match; also the scans that match again before the search.
+
+The first that matches may be from two positions, or blurred.
+"""
 UNWATCHED_S, MISSED = 0.5, 4.0
-"""Long enough to be lifted and put down, also counted in scans: a few that are lost are no news."""
+"""Time (s) that suffices to lift the robot and put it down, also in scan periods: a few lost scans are normal."""
 CHANGED: Final = 0.1
-"""Share of the beams by which what is seen fits worse than before, where it is not the same."""
+"""Decrease of the inlier share that means another view."""
 LEARNING: Final = 0.1
-"""Share of the latest match in what is usual: the time between two, and how many beams fit."""
+"""Share of the latest match in the usual values: the time between two, and the inlier share."""
 STILL_M, STILL_RAD = 0.005, 0.005
-"""Wheels stand that have turned by no more since they stopped, however often they tell it: 0.01 m/s for
-`UNWATCHED_S`."""
+"""Largest motion of the wheels (m, rad) at rest, over any number of readings: 0.01 m/s for `UNWATCHED_S`."""
 ROLLS_S, RESTED_S = 0.25, 0.5
-"""So long after the wheels have last turned what is seen may be of a robot that still rolls; from then until the second
-it is seen what is usual here. So long after they have last told anything it is not known, either, that they stand."""
+"""Times (s) after the last motion of the wheels.
+
+Before the first the robot may still roll. Between the two the usual value is measured. RESTED_S is also the time
+without odometry after which rest is unknown.
+"""
 GONE_M, GONE_RAD = 0.05, 0.05
-"""What was seen when the wheels stopped is of another place once they have turned by more: one that is jostled as the
-robot is lifted, or that drifts, turns by less."""
+"""Motion of the wheels (m, rad) that invalidates the value measured when they stopped.
+
+A robot that is shaken while it is lifted, or drifts, moves them by less.
+"""
 STRANGE, STRANGE_S, FORGET_S = 0.1, 0.5, 1.0
-"""By so much more of what should be in view than when the wheels stopped is looked through, in all for so long, while
-the robot is carried along a corridor (up to 0.22 in that of
-`tests/estimator/relocalisation/test_contradicting_scans.py`). People do not show in it, however many step up and leave:
-they hide walls, and nobody looks through walls for them. The third: after so long
-without any it is over."""
+"""Excess of the share seen through over its value when the wheels stopped, and its total duration (s).
+
+It appears while the robot is carried along a corridor (up to 0.22 in that of
+`tests/estimator/relocalisation/test_contradicting_scans.py`). People do not cause it, however many come and go: they
+hide walls, and no beam passes through walls for them. FORGET_S: time (s) without it after which it is over.
+"""
 LASTING_S: Final = 3.0
-"""After so long it is told though it goes on: the robot may have been put down where not all is alike."""
+"""Duration (s) after which it counts although it continues: the robot may now be where the surroundings differ."""
 NODES: Final = 1_000_000
-"""A quarter of what a robot that is lost may search, whose queue takes 100 MB. Those that were carried off needed 60 to
-310 thousand. One that ends there decides nothing, and is made once more with all of that; where that is not enough
-either nobody can say that the place is the only one."""
+"""Most nodes of the first search: a quarter of that of relocalisation, whose queue takes 100 MB.
+
+Kidnapped robots needed 60 to 310 thousand. A search that ends at the cap decides nothing, and is repeated with the full
+number. If that is not enough either, the pose is not known to be unique.
+"""
 PATIENCE_S, GIVEN_UP_S = 2.0, 10.0
-"""So long nothing is laid until the answer comes; then the map must go on, in a submap of its own, which goes if the
-answer is bad. One that has not come by the latter never will: it is asked anew."""
+"""Time (s) without keyframes while the search runs; then the map continues in a submap of its own.
+
+That submap is removed after a bad result. A result that has not arrived by GIVEN_UP_S is lost: the search is repeated.
+"""
 
 
 def on_odometry(state: Owners, record: Odometry) -> None:
-    """Take in whether the wheels stand; as long as they tell nothing, they are not known to turn."""
+    """Update whether the wheels are at rest; without readings they are not known to turn."""
     doubt = state.relocalisation.suspicion
     moved = doubt.moved + record.delta
     if not all(map(math.isfinite, moved.tolist())):
@@ -98,20 +110,20 @@ def on_odometry(state: Owners, record: Odometry) -> None:
 
 
 def turned(moved: Array, most_m: float = STILL_M, most_rad: float = STILL_RAD) -> bool:
-    """Whether wheels that have moved the robot by so much (x, y, yaw) do not stand."""
+    """Whether a motion (x, y, yaw) of the wheels exceeds that at rest."""
     x, y, yaw = moved.tolist()
     return math.hypot(x, y) > most_m or abs(yaw) > most_rad
 
 
 def waits(state: Owners) -> bool:
-    """Whether nothing may be laid into the map now, because the robot may be elsewhere."""
+    """Whether no keyframe may be created now, because the robot may be elsewhere."""
     doubt = state.relocalisation.suspicion
     looking = doubt.question is not None and state.motion.t_mono - doubt.t_asked < PATIENCE_S
     return looking or doubt.fitted > 0
 
 
 def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
-    """Whether the place is to be looked for now; to be asked before the match is fused."""
+    """Whether the search has to start now; called before the match is fused."""
     doubt, graph = state.relocalisation.suspicion, state.map.graph
     strange = was_strange(state, scan, points, match)
     if not match.ok or state.matching.local_map is None:
@@ -124,7 +136,7 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
         return False
     share, odd = match.inliers / max(1, match.queries), surprising(state, match)
     dt = state.motion.t_mono - state.matching.t_match
-    made = se2.between(state.matching.T_odom_scan, match.T_odom_base)  # wrong wheels move the prediction alone
+    made = se2.between(state.matching.T_odom_scan, match.T_odom_base)  # wrong odometry moves the prediction alone
     jump = odd and all(too_far(T, dt) for T in (match.correction, made))
     doubt.jumped |= jump
     doubt.leapt |= leapt
@@ -134,17 +146,17 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
     else:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
     if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt) and share > doubt.share - CHANGED:
-        doubt.fitted = 0  # the same picture from the same place
+        doubt.fitted = 0  # the same view from the same position
     if doubt.question is not None and state.motion.t_mono - doubt.t_asked > GIVEN_UP_S:
         give_up(state, doubt.question)
     return doubt.fitted >= ROW and doubt.question is None
 
 
 def was_strange(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
-    """Whether for a while much of the map was looked through, the wheels standing, and is not now, or still is.
+    """Whether the scan has seen through much of the map for a while, with the wheels at rest; returned once.
 
-    So it is where the robot was carried on by hand to where it looks alike: from one scan to the next little changes.
-    What the map has wrong there was looked through already when the wheels stopped. Told once.
+    That occurs when the robot is carried by hand to a similar position: from one scan to the next little changes.
+    Errors of the map there were already seen through when the wheels stopped.
     """
     doubt, now = state.relocalisation.suspicion, state.motion.t_mono
     rests_s, silent = now - doubt.t_rest, now - state.motion.t_odometry >= RESTED_S
@@ -166,7 +178,7 @@ def was_strange(state: Owners, scan: Scan, points: ScanPoints, match: MatchResul
 
 
 def looked_through(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> float:
-    """Share of the local map in view that a scan looks through from where it was taken; negative: it shows nothing."""
+    """Share of the local map in view that a scan sees through from its pose; negative without usable data."""
     if state.matching.local_map is None or match.reason in BLIND:
         return -1.0
     eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
@@ -175,9 +187,9 @@ def looked_through(state: Owners, scan: Scan, points: ScanPoints, match: MatchRe
 
 
 def leaps(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult, strange: bool) -> bool:
-    """Whether what is seen has changed all at once, or was `strange`: now, or while light told the place and not since.
+    """Whether the scene has changed, or was `strange`: now, or while light gave the pose and not since.
 
-    Where the robot is put down there may be no lamp, and for a moment nobody knows that it has been one.
+    Where the robot is put down there may be no lamp. The missing light is detected a little later.
     """
     doubt = state.relocalisation.suspicion
     eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
@@ -192,7 +204,7 @@ def leaps(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult, str
 
 
 def give_up(state: Owners, question: Question) -> None:
-    """Wait for an answer no longer; what was asked has to be asked again."""
+    """Abandon a search, which has to be repeated."""
     doubt = state.relocalisation.suspicion
     state.map.graph.jobs.cancel(question)
     doubt.question, doubt.fitted, doubt.odd = None, max(doubt.fitted, ROW), True
@@ -201,7 +213,7 @@ def give_up(state: Owners, question: Question) -> None:
 
 
 def unwatched(state: Owners) -> bool:
-    """Whether the robot has stood, or nobody knows, for long without a match; another one has come now."""
+    """Whether the robot was at rest, or without data, for long without a match; another one has arrived now."""
     doubt, now = state.relocalisation.suspicion, state.motion.t_mono
     usual, since = doubt.period_s, now - state.matching.t_match
     alone_s = min(since, max(doubt.unwatched_s, now - doubt.t_still))
@@ -218,7 +230,7 @@ def surprising(state: Owners, match: MatchResult) -> bool:
 
 
 def look(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> None:
-    """Ask whether the place, after the match is fused, stands a search of the whole map."""
+    """Queue a search of the whole map for the pose, after the match is fused."""
     graph, told, doubt = state.map.graph, state.map.settings.loops, state.relocalisation.suspicion
     assert told is not None
     assert state.matching.local_map is not None
@@ -239,27 +251,27 @@ def look(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> N
         run, then = partial(global_scan_match.look, query, told), partial(answered, state, asked)
         graph.jobs.ask(SEARCH, run, then, owner=asked)
         doubt.question, doubt.t_asked, graph.cut_at = asked, state.motion.t_mono, doubt.since
-    elif asked.jumped:  # nothing of the map is finished yet that could be searched
+    elif asked.jumped:  # no finished submap can be searched yet
         carried_off(state)
     else:
         doubt.since = 0
 
 
 def answered(state: Owners, asked: Question, payload: object) -> None:
-    """Search the whole map if the place is not the only one, or does not hold after a jump.
+    """Start relocalisation if the pose is not unique, or is not confirmed after a jump.
 
     A search that was not complete is repeated.
 
-    An answer that comes late counts as well: what was laid meanwhile is of the place that it is about.
+    A late result counts as well: keyframes created meanwhile belong to the same pose.
     """
     assert isinstance(payload, Looked)
     doubt = state.relocalisation.suspicion
     if doubt.question is not asked:
-        return  # light tells the place, the robot is being relocalised, or the map has been begun anew since
+        return  # light gives the pose, relocalisation runs, or the map has restarted since
     doubt.question = None
     here = payload.guesses[0]
     least = max(global_scan_match.LEAST, here.share - BEHIND)
-    if asked.leapt:  # any place will do that is not ruled out, if its own is; and in a corridor nothing holds a match
+    if asked.leapt:  # any pose that is not excluded counts, if its own is; in a corridor no match is confirmed
         least = 0.0 if here.verdict is Verdict.NO else here.share - BEHIND
     alone = all(fit.share < least for fit, _ in payload.fresh)
     holds = asked.holds or not asked.jumped or here.verdict is Verdict.HOLDS
@@ -274,7 +286,7 @@ def answered(state: Owners, asked: Question, payload: object) -> None:
 
 
 def carried_off(state: Owners) -> None:
-    """Search the whole map; a map of one scan, in which nobody can be looked for, is forgotten."""
+    """Start relocalisation in the whole map; a map of one scan, which cannot be searched, is cleared."""
     graph, since = state.map.graph, state.relocalisation.suspicion.since
     first = next((one.key for one in graph.submaps.values() if one.first >= since > 0), None)
     if first is not None:

@@ -1,4 +1,4 @@
-"""Taking the robot to a place that is sure: the detached part of the map is joined to the older one."""
+"""Acceptance of a relocalisation hypothesis: joins the detached submaps to the older map and moves the robot there."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from estimator.relocalisation.owners import Owners
 from estimator.result import LoopReason
 
 SURPRISE: Final = 16.3
-"""Squared Mahalanobis distance beyond which the way driven blindly is not the one that was found."""
+"""Squared Mahalanobis distance above which odometry across the break disagrees with the accepted pose."""
 
 
 def land(state: Owners, one: Hypothesis, alone: bool) -> None:
-    """The place is known: join what was mapped detached to the older map, and take the robot there.
+    """Accept a hypothesis: join the detached part to the older map, and move the robot there.
 
-    A map in a frame of its own is taken to the robot instead, if light has told where that is. ``alone``: by the laser
-    alone.
+    An unaligned map moves to the robot instead, if light has given the robot's pose. ``alone``: whether the lidar alone
+    has decided.
     """
     graph, (frame, fit) = state.map.graph, one.held[-1]
     found = [(at, it) for at, it in (one.held[0], one.held[-1]) if at.submap.key in graph.submaps]
@@ -43,7 +43,7 @@ def land(state: Owners, one: Hypothesis, alone: bool) -> None:
     since, first = parts.detached_since, parts.detached
     shift_map(state.map, moved, since)
     if stays:
-        state.pose.T_map_odom = T_map_odom  # for the moment: it is no jump
+        state.pose.T_map_odom = T_map_odom  # restored below: it is no jump
     else:
         state.pose.move(T_map_odom, state.motion.T_odom_base)
     if first is not None:
@@ -72,7 +72,7 @@ def land(state: Owners, one: Hypothesis, alone: bool) -> None:
 
 
 def bridge(graph: SubmapGraph, first: int | None) -> None:
-    """The way driven across the break counts as one that may be false, where what was found agrees with it."""
+    """Add odometry across the break as an edge that may be false, where the accepted pose agrees with it."""
     told, graph.parts.bridge = graph.parts.bridge, None
     if told is None or first not in graph.submaps or told[0] not in graph.submaps:
         return
@@ -84,7 +84,7 @@ def bridge(graph: SubmapGraph, first: int | None) -> None:
 
 
 def resettle(state: Owners, frame: Keyframe, P_map: Array, first: int | None) -> None:
-    """How sure the pose is now: by the match that has decided, the way since, and the map it was found in.
+    """Set the pose's covariance from the decisive match, the path since, and the map's alignment.
 
     ``first``: key of the first submap that is no part of that map.
     """
@@ -101,16 +101,16 @@ def resettle(state: Owners, frame: Keyframe, P_map: Array, first: int | None) ->
         return
     from estimator.relocalisation.light_evidence import disputed, told
 
-    if state.relocalisation.unaligned:  # map and robot are one again: light moves both, as after a first start
+    if state.relocalisation.unaligned:  # map and robot are joined again: light moves both, as after a first start
         alignment.since, state.relocalisation.unaligned = 0, False
-    elif alignment.placed or told(state.light, state.map.graph):  # the map's frame is the survey's
+    elif alignment.placed or told(state.light, state.map.graph):  # the map frame is the survey frame
         map_odom_filter.hang_on_anchor(state.pose, state.motion)
         here, left = (
             state.pose.here(state.motion.T_odom_base),
             (state.relocalisation.T_left, state.relocalisation.P_left),
         )
         P_map_survey = alignment_covariance(graph.submaps.values(), here, first, left)
-        alignment.P = alignment.P + R @ P_map_survey @ R.T  # no surer in the survey's frame than the map is
+        alignment.P = alignment.P + R @ P_map_survey @ R.T  # at least the map's own covariance
         alignment.placed, alignment.proved, alignment.broken = True, True, False
         alignment.gap, alignment.odd_since, alignment.since = None, None, state.map.next_key
         map_odom_filter.place_given(alignment, True)
@@ -118,4 +118,4 @@ def resettle(state: Owners, frame: Keyframe, P_map: Array, first: int | None) ->
         alignment.unheard, alignment.t_match = (
             disputed(state.light, state.map.graph),
             state.motion.t_mono,
-        )  # the laser has just told the place
+        )  # the lidar has just given the pose

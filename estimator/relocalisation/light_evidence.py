@@ -1,10 +1,11 @@
-"""What light says of the place while the robot is being relocalised in a stored map: windows to look in, and a witness.
+"""Light evidence for relocalisation: search windows from the lamps received, and confirmation or rejection of a pose.
 
-Light names lamps, and with stored gains their strengths give the position to a decimetre from the first epochs on;
-where codes repeat there are several. It says little of the heading until the robot has moved: that, and the
-confirmation, come from the laser. Nothing here is ever told to the `lights` filter, which hears of no place by laser.
+Light identifies lamps, and with stored gains their RSS gives the position to a decimetre from the first epochs on.
+Where codes repeat there are several positions. Light gives little information on the heading until the robot has moved:
+that, and the confirmation, come from the lidar. Nothing here changes the light filter, which never receives a pose by
+lidar.
 
-It counts only in a map whose frame is that of the light survey (`told`).
+It counts only in a map whose frame is the survey frame (`told`).
 """
 
 from __future__ import annotations
@@ -30,39 +31,41 @@ from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE, Fix, Link, LinkState
 
 CHANCE: Final = 1e-4
-"""A hypothesis of light less likely than that is none."""
+"""Smallest probability of a light hypothesis in use."""
 TOGETHER_M: Final = 1.0
-"""Hypotheses no farther apart are looked for in one window."""
+"""Largest distance (m) of hypotheses in one window."""
 MARGIN_M: Final = 0.25
-"""By which a window is larger than three deviations of what light says: walls and floor reflect as no model knows."""
+"""Margin (m) of a window beyond three sigma of light: reflections of walls and ground are not in the model."""
 GUESS_M: Final = 0.6
-"""Size of a window about a place read off a single epoch."""
+"""Radius (m) of a window around a single-epoch fix."""
 WIDEST_M: Final = 3.0
-"""Light that is vaguer than that says nothing."""
+"""Largest window (m); with a larger one light gives no information."""
 FACTOR: Final = 6.0
-"""By which the variance of a hypothesis of light counts: what is young about it, and what its model does not know."""
+"""Inflation of the variance of a light hypothesis: it has not converged, and its model has errors."""
 SLACK: Final = np.diag((0.1**2, 0.1**2, 0.05**2))
 LEAST: Final = 3
-"""Links used without which light is no witness."""
+"""Fewest links in use for a confirmation by light."""
 AGAINST: Final = 0.34
-"""Share of links against the place from which on it is none."""
+"""Share of inconsistent links above which there is no confirmation."""
 
 HEADED_M: Final = 3.0
-"""Way since the `lights` filter last looked for its place, before which its heading rules nothing out: strengths tell
-it by how the robot moves, and with wheels that turn, or walls that reflect, young hypotheses of it go astray together.
-The laser sees it at once, and where it sees two it goes on looking."""
+"""Path length (m) since the last start of the light filter, below which its heading excludes nothing.
+
+RSS gives the heading through motion. Wheel slip, or reflecting walls, bias all its young hypotheses together. The lidar
+sees the heading at once, and where it sees two the search continues.
+"""
 
 UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING, LinkState.UNSURVEYED, LinkState.TWIN)
-"""States of a link that say nothing of where the receiver is."""
+"""States of a link without information on the receiver's position."""
 ASKED_M: Final = 0.1
-"""Within that far of each other two poses receive the same lamps: a robot drives less from one epoch to the next."""
+"""Distance (m) of two poses with the same received lamps: a robot drives less from one epoch to the next."""
 MISPLACED: Final = 2
-"""So many lamps at least have to be received that cannot be at a pose: a single one may be a lamp that was moved."""
+"""Fewest received lamps that are impossible at a pose: a single one may be a lamp that was moved."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Where light allows the base to be in the map: within ``reach_m`` of (x, y), at any heading; how likely."""
+    """Region of the base in the map by light: within ``reach_m`` of (x, y), at any heading; with its probability."""
 
     x: float
     y: float
@@ -71,22 +74,22 @@ class Window:
 
 
 def told(light: LightChannel | None, graph: SubmapGraph) -> bool:
-    """Whether there is light, and the map's frame is that of its survey."""
+    """Whether there is light, and the map frame is the survey frame."""
     if light is None:
         return False
     return any(submap.light is not None for submap in graph.settled())
 
 
 def windows(light: LightChannel | None, graph: SubmapGraph, T_base_frame: Array | None = None) -> tuple[Window, ...]:
-    """Where light allows the robot to be, likeliest first; none where it says nothing.
+    """Regions of the robot by light, most probable first; none without information.
 
-    Where the links contradict the place that the `lights` filter still holds, as when the robot has been carried off,
-    the latest epoch is read by itself.
+    The links may be inconsistent with the position of the light filter, as after kidnapping. Then the latest epoch
+    alone gives the windows.
 
     Args:
         light: decoder and light filter.
         graph: of the map.
-        T_base_frame: where, seen from the base now, what is to be looked for was seen; None: here.
+        T_base_frame: pose of the searched frame relative to the present base; None: the base itself.
     """
     if not told(light, graph):
         return ()
@@ -102,10 +105,10 @@ def windows(light: LightChannel | None, graph: SubmapGraph, T_base_frame: Array 
 
 
 def glimpsed(light: LightChannel) -> tuple[Place, ...]:
-    """Places at which the latest epoch fits, whatever was known before; read once.
+    """Positions at which the latest epoch fits, without any prior; computed once per epoch.
 
-    One link more that does not fit rules no place out unless its lamp is too strong there: what a wall reflects counts
-    as direct in one epoch and not in the next, and the place where it does may be the right one.
+    One more link that does not fit excludes a position only if its lamp is too strong there. A reflection counts as
+    direct in one epoch and not in the next. The position where it does may be the correct one.
     """
     lights, epoch = light.filter, light.epoch
     if epoch is None or epoch.block & UNUSABLE or len(epoch.ids) == 0:
@@ -118,35 +121,35 @@ def glimpsed(light: LightChannel) -> tuple[Place, ...]:
 
 
 def contradicted(lights: Lights) -> bool:
-    """Whether what is received does not fit the place that the filter holds."""
+    """Whether the links are inconsistent with the position of the light filter."""
     return len(lights.tracks) == 1 and (math.isfinite(lights.t_lost) or math.isfinite(lights.t_odd))
 
 
 def disputed(light: LightChannel | None, graph: SubmapGraph) -> bool:
-    """Whether what is received does not fit the place that was held, or a new one has had to be looked for."""
+    """Whether the links are inconsistent with the position so far, or the light filter has had to restart."""
     return light is not None and (contradicted(light.filter) or light.filter.lost) and told(light, graph)
 
 
 def elsewhere(light: LightChannel | None, graph: SubmapGraph, T_map_base: Array) -> bool:
-    """Whether light has the robot under one set of lamps, and not here."""
+    """Whether light gives a position under one set of lamps, and not here."""
     return compatible(light, graph, T_map_base) is False and under_the_same_lamps(light, graph)
 
 
 def out_of_place(light: LightChannel | None, T_map_base: Array) -> bool:
-    """Whether a lamp is received now that cannot be received about a pose, as strong as it is.
+    """Whether a received lamp is impossible at a pose with that RSS.
 
-    It asks the latest epoch alone, not the `lights` filter, which wheels that turn more than they say can lead astray;
-    and not the heading, of which strengths know nothing. Of lamps of one code the nearest counts.
+    It uses the latest epoch alone, not the light filter, which wheel slip can bias. It does not use the heading, which
+    RSS does not depend on. Of lamps of one code the nearest counts.
     """
     return any(too_strong_at(light, T_map_base))
 
 
 def misplaced(light: LightChannel | None, alignment: SurveyAlignment | None, T_map_base: Array) -> bool:
-    """Whether most of the lamps received, two at least, are stronger than they can be about a pose.
+    """Whether most of the received lamps, at least two, are stronger than possible at a pose.
 
-    What stands in the way only ever takes light away, and one lamp that hangs elsewhere, or whose code another has, is
-    not the most of them: so it is the robot that is elsewhere, whatever the `lights` filter has made of it so far.
-    An epoch is asked once, unless the pose is moved meanwhile.
+    Obstacles only reduce light, and one lamp that was moved, or shares its code, is not the majority. So the robot is
+    elsewhere, whatever the light filter has estimated so far. An epoch is evaluated once, unless the pose moves
+    meanwhile.
     """
     if light is None or alignment is None or silent(light):
         return False
@@ -162,16 +165,16 @@ def _misplaced(light: LightChannel, T_map_base: Array, compared: bool) -> bool:
     result = light.result
     heard = sum(link.state not in UNHEARD for link in result.links)
     if heard < MISPLACED or (compared and 2 * len(result.accepted) >= heard):
-        return False  # what is used fits where the filter is, and where that is, is held against the pose: costs less
+        return False  # cheaper: used links fit the filter's position, and that is compared with the pose
     strong = too_strong_at(light, T_map_base)
     return sum(strong) >= MISPLACED and 2 * sum(strong) > len(strong)
 
 
 def glimpsed_elsewhere(light: LightChannel | None, T_map_base: Array) -> bool:
-    """Whether the latest epoch, read by itself, has the robot nowhere within `NEARER_M`, but somewhere.
+    """Whether the latest epoch alone gives positions, but none within `NEARER_M` of the pose.
 
-    Wheels that turn more than they say lead the filter astray, and not one epoch; it says more than that the lamps of
-    the place are received, which they are a few metres beside it too.
+    Wheel slip biases the filter, but not one epoch. The test is stricter than the lamps received, which are the same a
+    few metres away.
     """
     if light is None or not too_strong_at(light, T_map_base):
         return False
@@ -181,19 +184,19 @@ def glimpsed_elsewhere(light: LightChannel | None, T_map_base: Array) -> bool:
 
 
 def in_place(light: LightChannel | None, T_map_base: Array) -> bool:
-    """Whether lamps enough are received now, all of them as strong as they can be about a pose, and it may be there."""
+    """Whether enough lamps are received, all possible at a pose, and the latest epoch alone allows it."""
     strong = too_strong_at(light, T_map_base)
     return len(strong) >= LEAST and not any(strong) and not glimpsed_elsewhere(light, T_map_base)
 
 
 def about(lights: Lights, place: Place) -> Window:
-    """The window about a place of the receiver."""
+    """The window around a position of the receiver."""
     rx = lights.survey.receiver
     return Window(place.x, place.y, GUESS_M + math.hypot(rx.x, rx.y), math.exp(-0.5 * place.cost))
 
 
 def clustered(lights: Lights, T_base_frame: Array) -> tuple[Window, ...]:
-    """A window for each group of hypotheses that lie together; none where they are too vague to look in."""
+    """A window for each group of close hypotheses; none where they are too uncertain for a search."""
     if not lights.tracks:
         return ()
     chances = probabilities(lights.tracks).tolist()
@@ -215,14 +218,14 @@ def clustered(lights: Lights, T_base_frame: Array) -> tuple[Window, ...]:
 
 
 def window_of(group: list[tuple[Array, float, float]], more: float) -> Window:
-    """The circle about hypotheses (place, spread, chance) in which all of them lie."""
+    """The circle that contains all hypotheses (position, spread, probability)."""
     x, y = np.mean([at for at, _, _ in group], axis=0).tolist()
     reach = max(math.hypot(at[0] - x, at[1] - y) + spread for at, spread, _ in group)
     return Window(x, y, reach + more, sum(chance for _, _, chance in group))
 
 
 def beside(lights: Lights) -> float:
-    """What is added to a window where the lamps in use stand in one row: the other side of it fits nearly as well."""
+    """Enlargement (m) of a window under collinear lamps: the other side of their line fits nearly as well."""
     lamps = lights.catalogue.by_id
     seen = () if lights.result is None else lights.result.accepted
     at = [(lamps[k].x, lamps[k].y) for k in seen if k in lamps]
@@ -230,7 +233,7 @@ def beside(lights: Lights) -> float:
 
 
 def compatible(light: LightChannel | None, graph: SubmapGraph, T_map_base: Array) -> bool | None:
-    """Whether light allows a pose of the robot now; None where it says nothing."""
+    """Whether light allows a pose of the robot now; None without information."""
     around = windows(light, graph)
     if not around:
         return None
@@ -245,23 +248,23 @@ def compatible(light: LightChannel | None, graph: SubmapGraph, T_map_base: Array
 
 
 def likely(lights: Lights) -> list[Track]:
-    """The hypotheses that count."""
+    """The hypotheses with sufficient probability."""
     chances = probabilities(lights.tracks).tolist()
     return [track for track, chance in zip(lights.tracks, chances, strict=True) if chance >= CHANCE]
 
 
 def fits(track: Track, T_map_base: Array) -> bool:
-    """Whether a pose is that of a hypothesis, heading included as far as that is known."""
+    """Whether a pose agrees with a hypothesis, including the heading as far as it is known."""
     off = T_map_base - track.x[:3]
     off[2] = se2.wrap(float(off[2]))
     return float(off @ invert3(FACTOR * track.P[:3, :3] + SLACK) @ off) < SURPRISE
 
 
 def witness(light: LightChannel | None, graph: SubmapGraph, T_map_base: Array) -> bool:
-    """Whether light counts as the second witness of a pose that the laser has found.
+    """Whether light confirms a pose that the lidar has found.
 
-    It does where lamps are used and few are against it, and where the same lamps allow no other part of the building:
-    where codes repeat there are several. On which side of a row of lamps it stands the laser tells.
+    Lamps must be in use, few inconsistent, and the same lamps must allow no other part of the building. Where codes
+    repeat there are several. On which side of collinear lamps the robot is, the lidar decides.
     """
     if compatible(light, graph, T_map_base) is not True or not under_the_same_lamps(light, graph):
         return False
@@ -280,7 +283,7 @@ def witness(light: LightChannel | None, graph: SubmapGraph, T_map_base: Array) -
 
 
 def under_the_same_lamps(light: LightChannel | None, graph: SubmapGraph) -> bool:
-    """Whether what is received comes from the same lamps at all places that light allows."""
+    """Whether the received lamps are the same at all positions that light allows."""
     around = windows(light, graph)
     if len(around) < 2:
         return True
@@ -292,6 +295,6 @@ def under_the_same_lamps(light: LightChannel | None, graph: SubmapGraph) -> bool
 
 
 def hidden(lights: Lights, link: Link) -> bool:
-    """Whether a lamp is received so weakly that a wall stands before it, of which the survey knows nothing."""
+    """Whether a lamp is received so weakly that a wall unknown to the survey must stand before it."""
     lamp = None if link.lamp_id is None else lights.catalogue.by_id.get(link.lamp_id)
     return lamp is not None and not straight(lights, lamp, link.amplitude)

@@ -1,4 +1,4 @@
-"""Forgetting the map, when it is ordered or when the map may be of two places."""
+"""Map reset: clears the map and all state that refers to it, after a command or a kidnapping without a usable map."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from estimator.relocalisation.owners import Owners
 
 
 def forget_map(state: Owners) -> None:
-    """Drop the map; the pose now hangs on the start."""
+    """Clear the map; the start becomes the anchor of the pose."""
     pose, motion, matching = state.pose, state.motion, state.matching
     matching.local_map, matching.failures = None, 0
     state.map.clear()

@@ -1,4 +1,4 @@
-"""What relocalisation remembers from step to step."""
+"""Relocalisation state between steps: hypothesis set, kidnap detection, and the last pose of the earlier map."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ class RelocalisationMemory:
     """State of relocalisation.
 
     Attributes:
-        search: for the robot's place, while a part of the map is detached. suspicion: that the robot was carried off.
-        unaligned: the restored map does not lie in the light survey's frame, and the robot has not been found in it.
-        T_left, P_left: the pose when the map was left, and its covariance (3, 3; map axes) in the survey's frame then.
-        maps_dropped: stored maps that were dropped because the robot is nowhere in them.
+        search: hypothesis set, while a part of the map is detached.
+        suspicion: state of kidnap detection.
+        unaligned: whether the restored map does not lie in the survey frame, and the robot has not been found in it.
+        T_left, P_left: the last pose in the older map, and its covariance (3, 3; map axes) in the survey frame then.
+        maps_dropped: number of stored maps dropped because the robot is nowhere in them.
     """
 
     search: Seek = field(default_factory=Seek)
@@ -30,6 +31,6 @@ class RelocalisationMemory:
     maps_dropped: int = 0
 
     def forget(self) -> None:
-        """The map is forgotten."""
+        """Reset together with the map."""
         self.search, self.suspicion, self.unaligned = Seek(), Suspicion(), False
         self.T_left, self.P_left = se2.identity(), np.zeros((3, 3))

@@ -1,4 +1,4 @@
-"""The owners that relocalisation reads and corrects."""
+"""Interface to the parts of the estimator state that relocalisation reads and corrects."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Owners(Protocol):
 
     @property
     def matching(self) -> MatchMemory:
-        """What scan matching remembers."""
+        """State of scan matching."""
 
     @property
     def map(self) -> MapState:
@@ -40,8 +40,8 @@ class Owners(Protocol):
 
     @property
     def relocalisation(self) -> RelocalisationMemory:
-        """What relocalisation remembers."""
+        """State of relocalisation."""
 
     @property
     def time_offset(self) -> TimeOffset:
-        """Between the stamps of scans and wheels."""
+        """Time offset between the stamps of scans and odometry."""

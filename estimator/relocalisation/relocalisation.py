@@ -1,8 +1,8 @@
-"""Where in the map the robot is, when that is not known: after the start in a stored map, or after it was carried off.
+"""Relocalisation: finds the robot's pose in the map after a start in a stored map, or after kidnapping.
 
-Until it is found the robot maps on as ever, in a part of the graph that nothing joins to the older one. Looks in the
-older one (`global_scan_match`, jobs for the background) leave over some places (`hypothesis_tracking`); when one of
-them is sure, a loop joins the two parts, ``T_map_odom`` takes the robot there at once, and ordinary loops take over.
+Until it is found the robot maps as usual, in a detached part of the graph. Searches in the older part
+(`global_scan_match`, background jobs) leave some hypotheses (`hypothesis_tracking`). When one of them is certain, a
+loop joins the two parts. ``T_map_odom`` moves the robot there at once, and ordinary loops continue.
 """
 
 from __future__ import annotations
@@ -28,33 +28,37 @@ from estimator.result import Fix
 from estimator.scan_matching.branch_and_bound import Around
 
 Take = Callable[[Owners, Seek, Keyframe, tuple[Hypothesis, ...], object], None]
-"""Takes in what a look has found: for which search, at which keyframe, for which places it was asked."""
+"""Applies a search result: arguments are the state, hypothesis set, keyframe, tested hypotheses and result."""
 
 HINT_M, HINT_RAD = 1.0, 0.5
-"""How far the robot may be from where a person has said that it is."""
+"""Largest distance (m, rad) of the robot from an operator pose."""
 HINT_LOOKS: Final = 4
-"""Looks after which the map says that it is not there."""
+"""Searches without a match after which the operator pose is wrong."""
 PATIENCE_S: Final = 1.0
-"""Light is waited for so long before the whole map is searched."""
+"""Time (s) to wait for light before a search of the whole map."""
 ELSEWHERE_S, UNFIT = 3.0, 2
-"""Light that has the robot elsewhere for so long is believed that it was carried off; and at once when so many scans in
-a row did not fit."""
+"""Time (s) of light at another position after which the robot counts as kidnapped.
+
+UNFIT: number of consecutive scans without a match after which it counts at once.
+"""
 ASIDE_S: Final = 0.3
-"""And so soon where the laser has lost the place since light last agreed, and epoch after epoch, each read by itself,
-has the robot elsewhere: it may have been carried on while a new local map was begun."""
+"""The same time (s) where lidar tracking had a gap since light last agreed, and single epochs place it elsewhere.
+
+The robot may have been carried on while a new local map began.
+"""
 ALONE_M: Final = 5.0
-"""Way after which light alone, if it is good and agrees, is believed where the map knows nothing of the place."""
+"""Path length (m) after which valid light that agrees is accepted alone, where the map does not know the area."""
 STALE: Final = 5
-"""Scans after which a keyframe that was found nowhere is laid anew, where light says that it must be here."""
+"""Scans after which a keyframe without a match is created again, where light places it here."""
 YOUNG: Final = 2
-"""Keyframes of a map in which a robot can be looked for."""
+"""Fewest keyframes of a map that can be searched."""
 
 
 def begin(state: Owners) -> bool:
-    """Say that the robot may be anywhere in the map; False where there is no map yet that it could be found in.
+    """Detach the map and start relocalisation; False where there is no map to search.
 
-    A map of one submap that is not finished will do: the robot begins another one, and that one is finished then. So
-    will one whose submaps are just being finished.
+    One unfinished submap suffices: the robot begins another one, and the former is then finished. So do submaps that
+    are just being finished.
     """
     graph = state.map.graph
     young = graph.parts.detached is None and (len(graph.frames) >= YOUNG or len(graph.submaps) > 1)
@@ -75,18 +79,17 @@ def begin(state: Owners) -> bool:
 
 
 def leave_map(state: Owners) -> None:
-    """Keep how surely the map lies in the survey, as of the latest match with it; zero where light has not told it."""
+    """Store the pose and covariance of the map's alignment at the latest match; zero without an alignment by light."""
     alignment, memory = state.pose.alignment, state.relocalisation
     placed = alignment is not None and alignment.placed
     memory.T_left, memory.P_left = alignment.kept if alignment and placed else (se2.identity(), np.zeros((3, 3)))
 
 
 def local_map_lost(state: Owners) -> None:
-    """The local map is begun anew: the robot may have been carried off, unless light that tells now holds it here.
+    """Start relocalisation after a local map restart, unless current light confirms the pose.
 
-    Light that wheels have led away holds it too, as long as the lamps that are received are those of the place. One
-    that is being relocalised already may have been carried on: what was looked for before says nothing of where it is
-    now.
+    A light filter biased by odometry confirms it too, as long as the received lamps are possible here. A robot under
+    relocalisation may have been carried on; the search so far is then void.
     """
     alignment = state.pose.alignment
     held = False
@@ -100,7 +103,7 @@ def local_map_lost(state: Owners) -> None:
 
 
 def forget_detached(state: Owners) -> None:
-    """Let go of the keyframes of a part that has never been placed."""
+    """Remove the keyframes of a part that was never attached."""
     gone = [frame for key, frame in state.map.keyframes.items() if key >= state.map.parts.detached_since]
     for frame in gone:
         del state.map.keyframes[frame.key]
@@ -110,10 +113,10 @@ def forget_detached(state: Owners) -> None:
 
 
 def disown(state: Owners, first: int, since: int) -> None:
-    """The place was the wrong one: what was mapped since lies in it, and is what the next `begin` lets go of.
+    """Detach the submaps of a wrong pose, so that the next `begin` removes them.
 
-    Else the robot would find itself again in what it has laid there. ``first``: key of the first submap of that,
-    ``since``: ID of its first keyframe.
+    Otherwise the robot would find itself again in them. ``first``: key of the first such submap, ``since``: ID of its
+    first keyframe.
     """
     if state.map.parts.detached is None:
         leave_map(state)
@@ -122,7 +125,7 @@ def disown(state: Owners, first: int, since: int) -> None:
 
 
 def places(state: Owners) -> int | None:
-    """How many places fit, None where the place is known (see `StepResult.places`); light alone may know it too."""
+    """Number of hypotheses, None where the pose is known (see `StepResult.places`); light alone may know it too."""
     if state.map.parts.detached is None:
         return None
     lit = light_holds(state.pose, state.motion, state.light) and blind(state.pose, state.motion)
@@ -134,12 +137,12 @@ def places(state: Owners) -> int | None:
 
 
 def hinted(state: Owners) -> None:
-    """A person has just said where the robot is: it is looked for there first."""
+    """Restart the search around an operator pose."""
     state.relocalisation.search = Seek(terrain=state.relocalisation.search.terrain, hint=(state.pose.T_map_odom, 0))
 
 
 def keyframe_laid(state: Owners, frame: Keyframe) -> None:
-    """Look for a new keyframe, if the robot is being relocalised and no other look is under way."""
+    """Search a new keyframe during relocalisation, if no other search runs."""
     graph, told = state.map.graph, state.map.settings.loops
     if graph.parts.detached is None or told is None or graph.jobs.busy(state.relocalisation.search):
         return
@@ -150,14 +153,14 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
 
 
 def look_for(state: Owners, frame: Keyframe, around: tuple[Around, ...] | None) -> None:
-    """Hand out a look for a keyframe in what is not detached."""
+    """Queue the search of a keyframe in what is not detached."""
     hand_out(state, state.relocalisation.search, frame, state.map.graph.settled(), around, take_look)
 
 
 def hand_out(
     state: Owners, seek: Seek, frame: Keyframe, among: Iterable[Submap], around: tuple[Around, ...] | None, take: Take
 ) -> None:
-    """Hand out a look for a keyframe among submaps."""
+    """Queue the search of a keyframe among submaps."""
     graph, told = state.map.graph, state.map.settings.loops
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in among if one.settled is not None)
     if not pieces or told is None:
@@ -175,9 +178,9 @@ def hand_out(
 
 
 def step_done(state: Owners) -> None:
-    """Look again at the newest keyframe when light has come to say where it is, or says otherwise: robots may stand.
+    """Search the newest keyframe again when light has new windows, because the robot may be at rest.
 
-    And decide, when light has become a witness since.
+    It also accepts a hypothesis when light has confirmed it since.
     """
     graph, frame = state.map.graph, state.map.keyframes.get(state.pose.anchor)
     if state.light is None:
@@ -199,16 +202,16 @@ def step_done(state: Owners) -> None:
     asked = seek.lit == frame.key and not seek.elsewhere(allowed or ())
     stale = asked and seek.looks and not seek.alive and state.matching.scans_since_keyframe > STALE
     if stale or (allowed and state.matching.failures >= UNFIT):
-        afresh(state)  # it stands and was not found, or was just put down: what was kept says nothing of where it is
+        afresh(state)  # at rest without a match, or just put down: stored keyframes do not show its pose
     elif not asked:
         seek.searched = None
         look_for(state, frame, allowed)
 
 
 def by_light_alone(state: Owners) -> bool:
-    """End the search where light has long told the place, in a part of the building that the map does not know.
+    """End the search where light has long given the pose, in an area that the map does not know.
 
-    Both parts of the graph then hang on what light has said of them.
+    Priors by light then connect both parts of the graph.
     """
     from estimator.relocalisation.light_evidence import told
 
@@ -233,13 +236,13 @@ def by_light_alone(state: Owners) -> bool:
 
 
 def doubt(state: Owners) -> None:
-    """Say that the robot was carried off where light says so: at once if scans fit no more, else after a while.
+    """Start relocalisation where light contradicts the pose: at once if scans do not match, else after a while.
 
-    The laser may go on fitting, in a room that looks alike; then light must have it in one place, and not here. Where
-    light once proved the place, it must also receive a lamp that cannot be received here, or, where scans do not fit or
-    did not, epochs read by themselves must have the robot elsewhere: the filter itself can be led astray by wheels, and
-    a robot that the laser holds is not detached for that. A place that was found before the filter agreed is no such
-    proof: it may have been found in somebody's hands.
+    The lidar may go on matching in a room that looks alike. Then light must give one position, and not here. Where
+    light once confirmed the pose, more is required. A received lamp must be impossible here. Or, where scans do not
+    match or did not, single epochs must give another position. Odometry can bias the filter itself, and a tracked robot
+    is not detached for that. A pose found before the filter agreed has no such confirmation: the robot may have been
+    carried then.
     """
     from estimator.relocalisation import light_evidence
 
@@ -250,7 +253,7 @@ def doubt(state: Owners) -> None:
         alignment.elsewhere_since, alignment.aside_since, alignment.unheard = None, None, False
         return
     if alignment.gap is not None and alignment.gap <= SURPRISE and not light_evidence.contradicted(light.filter):
-        alignment.unheard = False  # the filter is at a new place already, and that is here
+        alignment.unheard = False  # the filter has a new position already, and that is here
     now = state.motion.t_mono
     alignment.elsewhere_since = now if alignment.elsewhere_since is None else alignment.elsewhere_since
     here = state.pose.here(state.motion.T_odom_base)
@@ -277,7 +280,7 @@ def afresh(state: Owners) -> bool:
 
 
 def light_is_coming(state: Owners) -> bool:
-    """Whether light may tell within a moment, so that the whole map need not be searched: it has just come on."""
+    """Whether light may give windows within a moment, so that the whole map need not be searched."""
     seek = state.relocalisation.search
     if not math.isfinite(seek.t_begin):
         seek.t_begin = state.motion.t_mono
@@ -289,7 +292,7 @@ def light_is_coming(state: Owners) -> bool:
 
 
 def windows(state: Owners, frame: Keyframe) -> tuple[Around, ...] | None:
-    """Where a keyframe is to be searched for, by what a person or light says; everywhere if None."""
+    """Search windows of a keyframe by operator or light; everywhere if None."""
     hint = state.relocalisation.search.hint
     if hint is not None:
         T_map_lidar = se2.compose(se2.compose(hint[0], frame.T_odom_keyframe), frame.T_base_lidar)
@@ -306,7 +309,7 @@ def windows(state: Owners, frame: Keyframe) -> tuple[Around, ...] | None:
 
 
 def take_look(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ...], payload: object) -> None:
-    """Take in what a look has found; and the decision, if it is one."""
+    """Apply the result of a search, and accept a hypothesis if it is decided."""
     assert isinstance(payload, Looked)
     if state.relocalisation.search is not seek or state.map.parts.detached is None:
         return
@@ -319,7 +322,7 @@ def take_look(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesi
 
 
 def ruled_out(state: Owners, one: Hypothesis) -> bool:
-    """Whether light has no hypothesis there; for good, which one epoch by itself cannot say."""
+    """Whether light excludes a hypothesis permanently, which a single epoch cannot."""
     if state.light is None or said(state, one) is not False:
         return False
     from estimator.relocalisation.light_evidence import contradicted
@@ -328,7 +331,7 @@ def ruled_out(state: Owners, one: Hypothesis) -> bool:
 
 
 def decide(state: Owners) -> None:
-    """Take the robot to the place that is sure, if one is."""
+    """Accept the certain hypothesis, if there is one."""
     seek = state.relocalisation.search
     one = seek.favourite()
     if one is not None:
@@ -342,9 +345,9 @@ def decide(state: Owners) -> None:
 
 
 def said(state: Owners, one: Hypothesis) -> bool | None:
-    """Whether a person or light says that this is the place (True) or that it is not; None where neither can tell."""
+    """Whether operator or light confirms a hypothesis (True) or rejects it (False); None without information."""
     if state.relocalisation.search.hint is not None:
-        return True  # it was looked for nowhere else
+        return True  # the search covered no other region
     if state.light is None:
         return None
     from estimator.relocalisation import light_evidence

@@ -1,10 +1,9 @@
-"""After a place was found in the whole map: whether what is seen from there on goes on being true of it.
+"""Relocalisation check: confirms or revokes an accepted pose by later keyframes, while the robot drives on.
 
-A room that is not in the map may look like one that is. While the robot stays in it nothing tells; what it sees when it
-leaves does, and then it is being relocalised again instead of going on in the wrong place. What it has mapped there
-meanwhile goes if the laser alone had decided; until the watch is over that is not saved, and takes the place of nothing
-older. Where light has the place and the map came in a frame of its own, it is the map that goes: it is set aside
-(`unaligned_map`).
+A room that is not in the map may look like one that is. Inside it no scan shows the difference; scans after leaving it
+do. Then relocalisation starts again. Submaps created there meanwhile are removed if the lidar alone had decided. During
+the trial they are not saved, and replace nothing older. If light gives the pose, and the map had a frame of its own,
+the map becomes unaligned instead (`unaligned_map`).
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ from estimator.relocalisation.hypothesis_tracking import Seek, Watch
 from estimator.relocalisation.owners import Owners
 
 STRIKES: Final = 3
-"""Looks, with none between that holds the place, after which it was the wrong one."""
+"""Rejected checks without a confirming one between them after which the pose was wrong."""
 
 
 def keyframe_laid(state: Owners, frame: Keyframe) -> None:
-    """Look whether a new keyframe is true of the map as it was before the place was found."""
+    """Check a new keyframe against the map as it was before the pose was found."""
     graph, told, watch = state.map.graph, state.map.settings.loops, state.map.parts.trial
     if not isinstance(watch, Watch) or told is None or graph.parts.detached is not None or graph.jobs.busy(watch):
         return
@@ -40,7 +39,7 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
 
 
 def lit(state: Owners) -> bool:
-    """Whether light has the robot here too: then one witness of the map does not rule the place out."""
+    """Whether light confirms the pose too; then one reference scan of the map does not exclude it."""
     if state.light is None:
         return False
     from estimator.relocalisation.light_evidence import witness
@@ -49,7 +48,7 @@ def lit(state: Owners) -> bool:
 
 
 def take(state: Owners, watch: Watch, payload: object) -> None:
-    """Take in what a look has found."""
+    """Apply the result of a check."""
     assert isinstance(payload, Looked)
     (fit,), watch.terrain = payload.guesses, payload.terrain
     watch.strikes = 0 if fit.verdict is Verdict.HOLDS else watch.strikes + (fit.verdict is Verdict.NO)

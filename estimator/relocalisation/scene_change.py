@@ -1,10 +1,10 @@
-"""Whether what is seen has changed from one scan to the next, all at once, by more than anything indoors can move.
+"""Scene change: sudden contradiction between consecutive scans, larger than moving objects can cause.
 
-A robot that is put down where it looks alike fits on, but not with every beam: doors, niches and ends of corridors are
-elsewhere. A surface that is looked through now, or a point that hangs where the scan before saw nothing, tells it. What
-moves of itself shows too, but never so: people walk and doors turn for many scans. So it is a leap where the scans
-before are alike, and those afterwards are, and each of these differs from the last of those a moment before. Corners
-behind which something comes into view, and people who step before a wall, hide things and contradict nothing.
+A robot put down where the surroundings look alike still matches, but not with every beam. Doors, niches and ends of
+corridors are elsewhere. A surface that is now seen through, or a point in space that the previous scan saw free, shows
+it. Moving objects show too, but over many scans: people walk and doors turn. So a scene change needs consistent scans
+before and consistent scans afterwards. Each of the later ones must contradict the last of the earlier ones, a short
+time before. Corners that open a view, and people who step before a wall, hide surfaces and contradict nothing.
 """
 
 from __future__ import annotations
@@ -23,18 +23,21 @@ from estimator.scan_matching.local_map import HIT, MARGIN, WIDTH, X, Y, look_at
 Floats = npt.NDArray[np.float32]
 Kinds = npt.NDArray[np.uint8]
 LOUD, QUIET = 0.04, 0.005
-"""Share of the evidence by which scans differ, and by which they do not."""
+"""Share of the evidence above which scans contradict each other, and below which they are consistent."""
 CALM: Final = 3
-"""Scans in a row that have to be alike, before and after."""
+"""Consecutive consistent scans required before and after."""
 LEAST: Final = 40
-"""Points that both must have been able to see, or two scans tell nothing of each other."""
+"""Fewest points visible in both scans for a comparison."""
 POINTS: Final = 200
-"""Points of a scan that are asked, at least."""
+"""Approximate number of compared points of a scan."""
 LATEST_S: Final = 0.25
-"""From the last scan before to the first afterwards: in 0.3 s somebody beside the robot takes a step, and a door shuts.
-At 10 Hz there is room for one scan between, which may be half of one place and half of the other."""
+"""Longest time (s) from the last scan before to the first afterwards.
+
+In 0.3 s a person beside the robot takes a step, and a door shuts. At 10 Hz there is time for one scan between, which
+may show half of each position.
+"""
 SOONEST: Final = 0.5
-"""Share of the usual time between two scans: stamps of those that come in a burst are not their own."""
+"""Smallest time between two scans as a share of the usual one: stamps of scans in a burst are not their own."""
 
 
 @kernel("void(f8[::1], f4[::1], u1[::1], f8[::1], f4[::1], u1[::1], f8, i8[::1])")
@@ -48,7 +51,7 @@ def compare(
     margin: float,
     told: Ints,
 ) -> None:
-    """Count the points of a scan that another one looks through (``told[0]``), and those that it sees too (``[1]``).
+    """Count the points of a scan that another one sees through (``told[0]``), and those that it sees too (``[1]``).
 
     Each scan as in :class:`Glance`. ``margin``: see `local_map.look_at`.
     """
@@ -77,10 +80,11 @@ def compare(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Glance:
-    """A scan as it was matched, in few bytes: it is part of every state that is kept.
+    """Compact scan signature at its matched pose: it is part of every checkpoint.
 
     Attributes:
-        t_end: its end. view: (5,) x, y, yaw of the lidar in the odom frame, first bearing and angle from beam to beam.
+        t_end: its end.
+        view: (5,) x, y, yaw of the lidar in the odom frame, first bearing and angle from beam to beam.
         reach, kind: range in metres and kind (`measurements.Beam`) of each beam.
     """
 
@@ -91,7 +95,7 @@ class Glance:
 
 
 def glance(t_end: float, eye: Array, beams: Beams) -> Glance:
-    """A scan that ended at ``t_end``, seen from ``eye`` (x, y, yaw); bearings evenly spaced, as of every lidar."""
+    """Signature of a scan that ended at ``t_end``, seen from ``eye`` (x, y, yaw); bearings are evenly spaced."""
     bearing, reach, kind = beams
     each = (bearing[-1] - bearing[0]) / max(1, len(bearing) - 1) if len(bearing) else 0.0
     first = bearing[0] if len(bearing) else 0.0
@@ -100,13 +104,15 @@ def glance(t_end: float, eye: Array, beams: Beams) -> Glance:
 
 @dataclass(slots=True, eq=False)
 class Leap:
-    """What is remembered of the latest scans.
+    """State of the scene change detection.
 
     Attributes:
-        latest: the newest. alike: so many in a row are, to the newest. t_first: end of the first of them.
-        calm: the newest of an earlier row of enough; the newest of all while nothing changes. loud: so many of the
-            latest in a row differ from it as nothing that moves of itself does.
-        seen: what is seen has changed, all at once.
+        latest: the newest scan.
+        alike: number of consecutive consistent scans, up to the newest.
+        t_first: end of the first of them.
+        calm: the newest scan of an earlier, long enough series; the newest of all while nothing changes.
+        loud: number of consecutive latest scans that contradict it more than moving objects can.
+        seen: whether a scene change has just occurred.
     """
 
     latest: Glance | None = None
@@ -117,7 +123,7 @@ class Leap:
     seen: bool = False
 
     def take(self, now: Glance, noise_m: float, usual_s: float) -> None:
-        """Take in a scan that was matched; ``usual_s``: from one to the next."""
+        """Add a scan that matched; ``usual_s``: usual time between two scans."""
         before = self.latest or now
         in_time = SOONEST * usual_s < now.t_end - before.t_end < LATEST_S
         share = differs(before, now, noise_m)
@@ -134,12 +140,12 @@ class Leap:
             self.calm, self.loud = now, 0
 
     def forget(self) -> None:
-        """Nothing is known of what was seen before."""
+        """Clear all scans."""
         self.latest, self.calm, self.alike, self.loud, self.seen = None, None, 0, 0, False
 
 
 def differs(one: Glance, other: Glance, noise_m: float) -> float:
-    """Share of the evidence by which two scans contradict each other, either way; 0 where there is too little."""
+    """Share of the evidence by which two scans contradict each other, in both directions; 0 with too little of it."""
     told, margin = np.zeros(2, np.int64), MARGIN + 5.0 * noise_m
     for a, b in ((one, other), (other, one)):
         compare(a.view, a.reach, a.kind, b.view, b.reach, b.kind, margin, told)

@@ -1,11 +1,11 @@
-"""A stored map in a frame of its own, set aside while light tells where the robot is: it is found then, or let go of.
+"""Unaligned map: a stored map not registered to the survey, kept apart until the lidar finds the robot in it.
 
-A map that was made without lamps does not say where it lies in the light survey, so light is no witness of a place in
-it. But once light has told the robot's place surely, that is its place, whether the map is found or not: a new map is
-begun there, as without a stored one, and whoever drives out of what the stored one knows is not lost. Meanwhile each
-new keyframe is looked for in the stored one by the laser alone. Where it is found the stored one is laid to where it
-belongs, the robot does not jump, and the two are one map. Where as much has been driven as the stored map may be of,
-and nothing of it holds, it is of somewhere else: it is let go of, and what was mapped since is a map of its own.
+A map made without lamps has no known pose in the survey, so light cannot confirm a pose in it. But once light gives the
+robot's pose with a small covariance, that pose is valid without the stored map. A new map begins there, as without a
+stored one. A robot that leaves the area of the stored map is therefore not lost. Meanwhile the lidar alone searches
+each new keyframe in the stored map. After a match the stored map moves to its pose in the survey, and both become one
+map. The robot does not jump. If no match follows on a path as long as the stored map, that map is of another area. It
+is then dropped, and the new map stands alone.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from estimator.relocalisation.relocalisation import hand_out
 from estimator.result import SURPRISE, Fix
 
 LEAST_M, MOST_M = 5.0, 100.0
-"""Way under lamps, at least and at most, after which a stored map in which nothing holds is let go of."""
+"""Shortest and longest path (m) under lamps after which a stored map without a match is dropped."""
 
 
 def step_done(state: Owners) -> None:
-    """Set the stored map aside once light has told the place, and there is something of a new one."""
+    """Separate the stored map once light gives the pose, and a new submap exists."""
     graph, parts, memory = state.map.graph, state.map.parts, state.relocalisation
     if not memory.unaligned or parts.detached is None or memory.search.hint is not None or not lit(state):
         return
@@ -39,7 +39,7 @@ def step_done(state: Owners) -> None:
 
 
 def lit(state: Owners) -> bool:
-    """Whether light goes on telling the place, and surely."""
+    """Whether light gives the pose now, with a small covariance."""
     alignment, light = state.pose.alignment, state.light
     holds = light_holds(state.pose, state.motion, light)
     if alignment is None or light is None or not holds or light.result.fix is not Fix.GOOD:
@@ -49,12 +49,12 @@ def lit(state: Owners) -> bool:
 
 
 def set_aside(state: Owners, own: Trial, begun_m: float, search: Seek) -> None:
-    """Go on in a map of its own.
+    """Separate the older map and continue in a map of its own.
 
     Args:
         state: its map is split.
-        own: where that map begins; what is older goes aside.
-        begun_m: way driven when the robot, its place being known by light, began to be looked for in what goes aside.
+        own: begin of that map; everything older is separated.
+        begun_m: path length at which the search in the older map began, after light had given the pose, m.
         search: that search so far.
     """
     graph, parts, first, since = state.map.graph, state.map.parts, own.first, own.since
@@ -75,7 +75,7 @@ def set_aside(state: Owners, own: Trial, begun_m: float, search: Seek) -> None:
     state.map.keyframes = {key: frame for key, frame in state.map.keyframes.items() if key >= since}
     parts.attach()
     parts.bridge, parts.trial, state.relocalisation.search = None, None, Seek()
-    parts.session_start, parts.fixed = 0, False  # light holds the robot in a map of its own
+    parts.session_start, parts.fixed = 0, False  # light gives the robot's pose in a map of its own
     state.relocalisation.unaligned = False
     graph.waiting, graph.tied, graph.ties, graph.stale = [], None, {}, True
     relist(state.map, 0)
@@ -83,7 +83,7 @@ def set_aside(state: Owners, own: Trial, begun_m: float, search: Seek) -> None:
 
 
 def keyframe_laid(state: Owners, frame: Keyframe) -> None:
-    """Look for a new keyframe in the map that was set aside, or let go of that one."""
+    """Search a new keyframe in the unaligned map, or drop that map."""
     graph, parts = state.map.graph, state.map.parts
     aside = parts.aside
     if not isinstance(aside, SearchedAside) or parts.detached is not None or parts.trial is not None:
@@ -99,12 +99,12 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
 
 
 def enough(keyframe_m: float, aside: SearchedAside) -> float:
-    """Way (m) after which a robot would have been found: as much as the map may be of, within bounds."""
+    """Path length (m) after which a robot would have been found: as long as the map can cover, within limits."""
     return min(max(LEAST_M, len(aside.submaps) * SIZE * keyframe_m), MOST_M)
 
 
 def take(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ...], payload: object) -> None:
-    """Take in what a look has found; and the decision, if it is one."""
+    """Apply the result of a search, and accept a hypothesis if it is decided."""
     assert isinstance(payload, Looked)
     aside = state.map.parts.aside
     if not isinstance(aside, SearchedAside) or aside.search is not seek or state.map.parts.detached is not None:
@@ -116,9 +116,9 @@ def take(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ..
 
 
 def found(state: Owners, aside: SearchedAside, one: Hypothesis) -> None:
-    """The map that was set aside is taken to where the robot has been found in it, and the two are one.
+    """Move the unaligned map to the pose of the accepted hypothesis and join the two maps.
 
-    It is watched as every place is that the laser alone has found.
+    As after every pose found by the lidar alone, a trial follows.
     """
     graph, parts = state.map.graph, state.map.parts
     if not any(frame.submap.key in graph.submaps for frame, _ in one.held):

@@ -1,1 +1,1 @@
-"""Deskew, distance region and ICP (Eq. 10-15): a scan against the local map gives a match (T2)."""
+"""Deskew, distance region and ICP (Eq. 10-15): registration of a scan to the local map (T2)."""

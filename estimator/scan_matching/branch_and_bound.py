@@ -1,11 +1,10 @@
-"""Where in a map a scan fits, without any idea of the pose: correlative search by branch and bound, exact.
+"""Exact branch-and-bound correlative scan matching: the poses where a scan fits a map, without a prediction.
 
-A candidate pose is scored by the mean likelihood, read from a field of the map, at the scan's points. The field at
-level l holds the largest likelihood of a window of ``2**l`` cells, so that one score there bounds the scores of all
-``4**l`` shifts in the window (Olson: Real-Time Correlative Scan Matching, ICRA 2009; Hess et al.: Real-Time Loop
-Closure in 2D LIDAR SLAM, ICRA 2016). Candidates are opened best first; the first that is reached at the finest level
-is the best there is, the next ones follow in order. That order is what makes ambiguity visible: a symmetric room has
-two best places, and both come out.
+The score of a candidate pose is the mean likelihood at the scan's points, from a field of the map. The field at level l
+holds the largest likelihood of a window of ``2**l`` cells. So one score there is an upper bound for all ``4**l`` shifts
+in the window (Olson: Real-Time Correlative Scan Matching, ICRA 2009; Hess et al.: Real-Time Loop Closure in 2D LIDAR
+SLAM, ICRA 2016). Candidates are opened best first. The first at the finest level is the global optimum, and the next
+ones follow in order. This reveals ambiguity: a symmetric room has two best poses, and the search returns both.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ Node = tuple[np.int32, np.int32, np.int32, np.int32]
 """Level, column, row, heading."""
 
 LEVELS = 8
-"""Windows of up to 128 cells."""
+"""Levels of the pyramid: windows of up to 128 cells."""
 
 SPREAD = 3.0
-"""Cells beyond which a point supports nothing, in deviations of the field."""
+"""Radius of a point's likelihood, in sigmas of the field."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Around:
-    """Where to search, if not everywhere: the sensor within ``reach_m`` (each axis) and ``reach_rad`` of a pose."""
+    """Search region, if not everywhere: the sensor within ``reach_m`` (each axis) and ``reach_rad`` of a pose."""
 
     T_map_lidar: Array
     reach_m: float
@@ -42,12 +41,13 @@ class Around:
 
 @dataclass(slots=True, eq=False)
 class Field:
-    """Likelihood of a scan's point at each place of a map.
+    """Likelihood field of a map: of a scan's point at each position.
 
     Attributes:
-        pyramid: (levels, rows, columns) uint8, 255 on a surface; row r, column c is the cell whose lower left corner is
-            ``origin + resolution * (c, r)``; at level l it stands for the window of ``2**l`` cells that begins there.
-        origin: (x, y) m. resolution: m a cell.
+        pyramid: (levels, rows, columns) uint8, 255 on a surface. Row r, column c is the cell whose lower left corner is
+            ``origin + resolution * (c, r)``. At level l it stands for the window of ``2**l`` cells that begins there.
+        origin: (x, y) m.
+        resolution: m a cell.
     """
 
     pyramid: Bytes
@@ -57,7 +57,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hit:
-    """A place where the scan fits: the sensor's pose (x, y, yaw) and the mean likelihood there, 0 to 1."""
+    """A pose where the scan fits: the sensor's pose (x, y, yaw) and the mean likelihood there, 0 to 1."""
 
     T_map_lidar: Array
     score: float
@@ -65,11 +65,12 @@ class Hit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """What a search has found.
+    """Result of a search.
 
     Attributes:
-        hits: best first, no two nearer to each other than asked for. nodes: opened. complete: False where the cap on
-            nodes ended it: then a better place may have been missed.
+        hits: best first, no two closer to each other than the settings allow.
+        nodes: number of nodes opened.
+        complete: False where the cap on nodes ended the search: a better pose may then have been missed.
     """
 
     hits: tuple[Hit, ...]
@@ -80,7 +81,7 @@ class Search:
 def field_of(
     points: Array, resolution: float = 0.05, sigma_m: float = 0.05, reach_m: float = 1.0, around: Around | None = None
 ) -> Field:
-    """The field of a map's surface points (n, 2), as large as they reach and ``reach_m`` more, and as is searched.
+    """Likelihood field of a map's surface points (n, 2), over their extent plus ``reach_m`` and the search region.
 
     Raises:
         ValueError: no points, or points that are not finite.
@@ -100,7 +101,10 @@ def field_of(
 
 @kernel("void(f8[:, ::1], f8[::1], f8[::1], u1[:, ::1])", aside=True)
 def spread(points: Array, origin: Array, how: Array, field: Bytes) -> None:
-    """Gaussian of the distance to the nearest point, cut off at SPREAD deviations. ``how``: resolution, sigma (m)."""
+    """Write the Gaussian of the distance to the nearest point, cut off at SPREAD sigmas.
+
+    ``how``: resolution, sigma (m).
+    """
     resolution, sigma = how[0], how[1]
     reach = int(np.ceil(SPREAD * sigma / resolution))
     rows, columns = field.shape
@@ -134,9 +138,10 @@ def widen(pyramid: Bytes) -> None:
 
 @kernel("f8(u1[:, :, ::1], i4[:, ::1], i8, i8, i8)", inner=True)
 def score_at(pyramid: Bytes, cells: Nodes, level: int, column: int, row: int) -> float:
-    """Mean of the field under the points (cells (n, 2) from the sensor) with the sensor in the window there.
+    """Mean of the field under the points (cells (n, 2) from the sensor) with the sensor in the given window.
 
-    Beyond the field's lower edge a window still reaches in: it is read at the edge, which bounds it from above.
+    A window below the field's lower edge can still reach into the field. It is read at the edge, which gives an upper
+    bound.
     """
     rows, columns = pyramid.shape[1], pyramid.shape[2]
     window = (1 << level) - 1
@@ -167,7 +172,7 @@ def push(keys: Array, nodes: Nodes, count: int, key: float, node: Node) -> None:
 
 @kernel("void(f8[::1], i4[:, ::1], i8)", inner=True)
 def pop(keys: Array, nodes: Nodes, count: int) -> None:
-    """Remove the top of a heap of ``count``; the caller has read it."""
+    """Remove the top of a heap of ``count`` entries."""
     last = count - 1
     key = keys[last]
     i = 0
@@ -190,7 +195,7 @@ def pop(keys: Array, nodes: Nodes, count: int) -> None:
 
 @kernel("b1(f8[:, ::1], i8, UniTuple(i4, 4), i8, f8[::1])", inner=True)
 def near_hit(found: Array, hits: int, node: Node, headings: int, how: Array) -> bool:
-    """Whether all of a node's window lies where a better hit has been found."""
+    """Whether all of a node's window is close to a better hit."""
     level, column, row, h = node
     window = (1 << level) - 1
     for k in range(hits):
@@ -207,12 +212,11 @@ def near_hit(found: Array, hits: int, node: Node, headings: int, how: Array) -> 
 
 @kernel("Tuple((i8, i8, b1))(u1[:, :, ::1], i4[:, :, ::1], i8[::1], f8[::1], f8[:, ::1])", aside=True)
 def branch(pyramid: Bytes, turned: Nodes, box: Ints, how: Array, found: Array) -> tuple[int, int, bool]:
-    """Best-first search: number of hits, nodes opened, whether it is complete.
+    """Best-first search; returns the number of hits, the nodes opened, and whether the search is complete.
 
     ``turned``: (headings, points, 2) cells of the scan at each heading. ``box``: first and last column, first and last
-    row in which the sensor may stand, and 1 if the headings go all round. ``how``: least score, cap on nodes, cells and
-    headings within which two hits are one, share of the best hit's score that the others need. ``found``: rows of
-    column, row, heading, score.
+    row of the sensor, and 1 if the headings cover the full circle. ``how``: smallest score, cap on nodes, distance of
+    one hit in cells and headings, smallest share of the best score. ``found``: rows of column, row, heading, score.
     """
     headings, top = len(turned), pyramid.shape[0] - 1
     step = 1 << top
@@ -260,14 +264,17 @@ def branch(pyramid: Bytes, turned: Nodes, box: Ints, how: Array, found: Array) -
 
 @dataclass(frozen=True, slots=True)
 class SearchSettings:
-    """How to search.
+    """Settings of a search.
 
     Attributes:
-        least: score below which no place is worth having; ratio: the same, as a share of the best one's.
-        hits: most to return. nodes: most to open.
-        apart_m, apart_rad: hits nearer than this in both are one.
-        points: of the scan at most. heading_rad: step of the headings; 0: what moves the farthest point by a cell.
-        around: where; everywhere and at every heading if None.
+        least: smallest score of a hit.
+        ratio: the same, as a share of the best score.
+        hits: most hits returned.
+        nodes: most nodes opened.
+        apart_m, apart_rad: hits closer than this in both are one.
+        points: most points of the scan.
+        heading_rad: step of the headings; 0: the step that moves the farthest point by a cell.
+        around: search region; everywhere and at every heading if None.
     """
 
     least: float = 0.4
@@ -282,7 +289,7 @@ class SearchSettings:
 
 
 def search(field: Field, points: Array, settings: SearchSettings = SearchSettings()) -> Search:
-    """Where in the field a scan's points (n, 2), seen from the sensor, fit best.
+    """The poses in the field where a scan's points (n, 2), in the sensor's frame, fit best.
 
     Raises:
         ValueError: no points.
@@ -302,7 +309,7 @@ def search(field: Field, points: Array, settings: SearchSettings = SearchSetting
         return Search((), 0, True)
     c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
     turned = np.stack((c * few[:, 0] - s * few[:, 1], s * few[:, 0] + c * few[:, 1]), axis=2)
-    # the sensor stands in the middle of its cell
+    # the sensor is at the centre of its cell
     cells = np.floor(turned / field.resolution + 0.5).astype(np.int32)
     found = np.empty((settings.hits, 4))
     apart = (settings.apart_m / field.resolution, settings.apart_rad / step)
@@ -312,7 +319,7 @@ def search(field: Field, points: Array, settings: SearchSettings = SearchSetting
 
 
 def _boxed(field: Field, around: Around, step: float) -> tuple[Ints, Array]:
-    """Cells in which the sensor may stand, and headings it may have."""
+    """Cells of the sensor's position, and headings, within the search region."""
     x, y, heading = around.T_map_lidar.tolist()
     low = np.floor((np.array((x, y)) - around.reach_m - field.origin) / field.resolution).astype(np.int64)
     high = np.floor((np.array((x, y)) + around.reach_m - field.origin) / field.resolution).astype(np.int64)

@@ -1,4 +1,4 @@
-"""From a scan to points: quality filter (Q, L of the paper), deskew, mount."""
+"""Deskewed surface points of a scan in the base frame: quality filter (Q, L of the paper), deskew, mount."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ HIT: int = int(Beam.HIT)
 NO_INTENSITY: Array = np.empty(0)
 
 FRESH = 64
-"""Every so many beams sine and cosine are taken afresh, so that rounding does not add up."""
+"""Beams after which sine and cosine are computed again, so that rounding does not accumulate."""
 
 CHORD_M, SPARSE_M = 0.15, 0.3
-"""Length over which a point's tangent is taken: ten times the noise of a good range sensor."""
+"""Length (m) of the chord for a point's tangent, ten times the noise of a good range sensor.
+
+SPARSE_M: largest distance (m) of an adjacent point that replaces a missing chord end.
+"""
 
 
 @dataclass(slots=True, eq=False)
@@ -47,11 +50,13 @@ def place_beams(
     quality: float,
     xy: Array,
 ) -> int:
-    """Keep the beams that pass the filter and carry each from its own instant to the scan's end; count of points.
+    """Write the deskewed points of the beams that pass the filter to ``xy``; returns their number.
 
-    ``twist`` is the constant body motion over the scan; beam i of n is ``(n - 1 - i) / (n - 1)`` of it before the end.
-    Bearings of a device are evenly spaced, so their sines come from the one before by a rotation (a small difference is
-    taken by its first order, which leaves less than 1e-10; a large one afresh).
+    ``twist`` is the constant body motion (m, m, rad) over the scan. Beam i of n precedes the end by the share ``(n - 1
+    - i) / (n - 1)`` of it.
+    Bearings of a device are evenly spaced, so a rotation of the previous beam gives the next sine and cosine. A small
+    deviation from even spacing is corrected to first order, with an error below 1e-10. A large one is computed
+    directly.
     """
     bearing, distance, kind, intensity = beams
     n = len(bearing)
@@ -94,7 +99,7 @@ def place_beams(
 
 
 def points_of(scan: Scan, motion: Array, far: float, quality: float) -> ScanPoints:
-    """Filter, deskew with ``motion`` (base motion from the first to the last beam) and mount a scan.
+    """Filter, deskew and mount a scan; ``motion`` is the base motion (m, m, rad) from the first to the last beam.
 
     Raises:
         ValueError: the scan's arrays differ in length, which no device can cause.
@@ -113,10 +118,10 @@ def points_of(scan: Scan, motion: Array, far: float, quality: float) -> ScanPoin
 
 @kernel("void(f8[:, ::1], i8, f8[:, ::1])")
 def orient(xy: Array, stride: int, out: Array) -> None:
-    """Every ``stride``-th point with the unit tangent of its surface: rows (x, y, t_x, t_y) of ``out``.
+    """Write every ``stride``-th point with the unit tangent of its surface: rows (x, y, t_x, t_y) of ``out``.
 
-    The tangent is the chord of the points around it, or of the next beams where they are sparse; it only has to tell
-    one wall of a corner from the other. It is (0, 0) where the chord is too short to say.
+    The tangent is the chord of the surrounding points, or of the adjacent beams where they are sparse. It only has to
+    distinguish the two walls of a corner. It is (0, 0) where the chord is too short.
     """
     n = len(xy)
     low = high = 0
@@ -142,7 +147,7 @@ def orient(xy: Array, stride: int, out: Array) -> None:
 
 
 def oriented(points: ScanPoints, most: int) -> Array:
-    """At most ``most`` of the points, evenly, with their tangents: (n, 4), see :func:`orient`."""
+    """At most ``most`` points, evenly selected, with their tangents: (n, 4), see :func:`orient`."""
     n = len(points.xy)
     stride = max(1, -(-n // max(1, most)))
     out = np.empty((-(-n // stride), 4))
@@ -151,7 +156,7 @@ def oriented(points: ScanPoints, most: int) -> Array:
 
 
 def unturned(bearing_rad: Array, turned_rad: float) -> Array:
-    """Bearings as they would be had the lidar not turned during the scan, seen from its end."""
+    """Bearings (rad) as the lidar would measure them without its rotation during the scan, in its frame at the end."""
     n = len(bearing_rad)
     if turned_rad == 0.0 or n < 2:
         return bearing_rad
@@ -160,5 +165,5 @@ def unturned(bearing_rad: Array, turned_rad: float) -> Array:
 
 @lru_cache(maxsize=4)
 def _to_come(n: int) -> Array:
-    """Share of a scan that is still to come at each of its ``n`` beams."""
+    """Share of the scan that remains after each of its ``n`` beams, 1 to 0."""
     return np.asarray(1.0 - np.arange(n) / (n - 1))

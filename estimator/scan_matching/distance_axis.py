@@ -1,12 +1,12 @@
-"""The distance axis (Eq. 10): reference points ordered by their distance from a centre, in one sequence or in sectors.
+"""The distance axis (Eq. 10): reference points sorted by distance from a centre, in one sequence or in sectors.
 
-The single axis is the paper's "spatially adjacent sequence". In the ring x sector form the plane around the centre is
-cut into sectors, each with an axis of its own, one after the other in the same array; ``GROUP`` neighbouring sectors
-also know the ring between their nearest and their farthest point. A scan comes ordered by bearing, so that sorting it
-into sectors moves hardly anything.
+The single axis is the paper's "spatially adjacent sequence". The ring x sector form divides the plane around the centre
+into sectors. Each sector has its own axis, one after the other in the same array. Each group of ``GROUP`` neighbouring
+sectors also stores its ring: the distances of its nearest and its farthest point. A scan is ordered by bearing, so
+sorting it into sectors moves few points.
 
-Light points (LEDs in the body frame of the reference keyframe, Fig. 2b) lie on the axis beside the surface points. They
-are kept apart from the rows that are searched, so no laser point can take one for its partner.
+Light points (lamps in the frame of the reference keyframe, Fig. 2b) lie on the axis beside the surface points. They are
+stored separately from the searched rows, so no lidar point can be paired with one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GROUP = 8
 """Sectors that share a ring."""
 
 FEWEST = 32
-"""Sectors, where there are any: a group must not span more than a right angle."""
+"""Fewest sectors, where there are any: a group must not span more than a right angle."""
 
 ONE_AXIS = 16
 """Fewer points than this are searched on the single axis (measured: docs/estimator.md)."""
@@ -33,13 +33,13 @@ class Axis:
     """Reference points on their distance axis.
 
     Attributes:
-        centre: (x, y) the distances are measured from.
-        rows: (n, 3) points relative to the centre and their distance: x, y, r; ordered by sector, then by r.
-        label: (n,) index of each row in the array the axis was built from.
+        centre: (x, y) from which the distances are measured, m.
+        rows: (n, 3) points relative to the centre and their distance: x, y, r in m; ordered by sector, then by r.
+        label: (n,) index of each row in the array from which the axis was built.
         start: (sectors + 1,) first row of each sector. One sector is the paper's single axis.
-        rays: (sectors + 1, 4) unit vector of each sector's first bound, counter-clockwise from +x; and, where a group
-            of sectors begins, the distance of the group's nearest and farthest point.
-        lights: (k, 3) light points relative to the centre and their distance, in the order they were given.
+        rays: (sectors + 1, 4) unit vector of each sector's first boundary, counter-clockwise from +x. Where a group of
+            sectors begins, columns 2 and 3 hold the distances of its nearest and farthest point.
+        lights: (k, 3) light points relative to the centre and their distance, in the order given.
     """
 
     centre: Array
@@ -51,12 +51,12 @@ class Axis:
 
 
 def sector_count(points: int) -> int:
-    """How many sectors make the search fastest for this many reference points: two points in each, over 270 deg."""
+    """Number of sectors for the fastest search of this many reference points: two points in each, over 270 deg."""
     return min(8192, max(FEWEST, 2 * points // 48 * 16)) if points >= ONE_AXIS else 1
 
 
 def build_axis(points: Array, centre: Array, sectors: int = 0, lights: Array | None = None) -> Axis:
-    """Order points of shape (n, 2) around ``centre``; ``sectors`` 0 chooses by their number.
+    """Build the axis of points (n, 2) around ``centre``; ``sectors`` 0 selects the count from the number of points.
 
     ``lights``: (k, 2) light points in the same frame.
 
@@ -78,7 +78,7 @@ def build_axis(points: Array, centre: Array, sectors: int = 0, lights: Array | N
 
 @kernel("void(f8[:, ::1])")
 def bound_sectors(rays: Array) -> None:
-    """Bounds of the sectors as ``Axis.rays``, with empty rings: turns (:func:`turn_of`) of equal size."""
+    """Write the boundaries of equal sectors (by :func:`turn_of`) to ``Axis.rays``, with empty rings."""
     sectors = len(rays) - 1
     for s in range(sectors + 1):
         turn = 4.0 * (s % sectors) / sectors
@@ -92,7 +92,7 @@ def bound_sectors(rays: Array) -> None:
 
 @kernel("f8(f8, f8)", inline=True)
 def turn_of(x: float, y: float) -> float:
-    """A number in [0, 4) that grows with the angle of (x, y), one unit a quadrant; cheaper than an arctangent."""
+    """Pseudo-angle of (x, y) in [0, 4): it grows with the angle, one unit a quadrant; cheaper than an arctangent."""
     if y >= 0.0:
         if x > 0.0:
             return y / (x + y)
@@ -104,13 +104,13 @@ def turn_of(x: float, y: float) -> float:
 
 @kernel("i8(f8, f8, i8)", inline=True)
 def sector_of(x: float, y: float, sectors: int) -> int:
-    """Sector of a point relative to the centre."""
+    """Index of the sector of a point relative to the centre."""
     return max(0, min(sectors - 1, int(turn_of(x, y) * 0.25 * sectors)))
 
 
 @kernel("f8(f8[:, ::1], i8, f8, f8, f8)", inner=True)
 def ray_distance2(rays: Array, s: int, qx: float, qy: float, r2: float) -> float:
-    """Squared distance of a query from the ray ``s``: beyond a right angle its nearest point is the centre."""
+    """Squared distance of a query from the ray ``s``; beyond a right angle its nearest point is the centre."""
     if rays[s, 0] * qx + rays[s, 1] * qy <= 0.0:
         return r2
     cross: float = rays[s, 0] * qy - rays[s, 1] * qx
@@ -119,7 +119,7 @@ def ray_distance2(rays: Array, s: int, qx: float, qy: float, r2: float) -> float
 
 @kernel("b1(f8[::1], f8, f8, f8)", inline=True)
 def is_behind(row: Array, x: float, y: float, r: float) -> bool:
-    """Whether a row belongs behind (x, y, r) on its axis."""
+    """Whether a row comes after (x, y, r) on its axis."""
     if row[2] != r:
         return bool(row[2] > r)
     return bool(row[0] > x or (row[0] == x and row[1] > y))
@@ -127,7 +127,7 @@ def is_behind(row: Array, x: float, y: float, r: float) -> bool:
 
 @kernel("void(f8[:, ::1], i8[::1], i8, i8)", inner=True)
 def sort_rows(rows: Array, label: Ints, lo: int, hi: int) -> None:
-    """Shell's sort of rows [lo, hi) by distance; rows at one distance by x and y, so that equal points lie together."""
+    """Shell sort of rows [lo, hi) by distance, then by x and y, so that equal points are adjacent."""
     gap = 1
     while gap < (hi - lo) // 3:
         gap = 3 * gap + 1
@@ -145,7 +145,7 @@ def sort_rows(rows: Array, label: Ints, lo: int, hi: int) -> None:
 
 @kernel("void(f8[:, ::1], f8, f8, Tuple((f8[:, ::1], i8[::1], i8[::1], f8[:, ::1])))")
 def order_points(points: Array, cx: float, cy: float, out: tuple[Array, Ints, Ints, Array]) -> None:
-    """Eq. 10: counting sort into sectors, then by distance within each (Shell's sort; a sector holds a few points)."""
+    """Eq. 10: counting sort into sectors, then a Shell sort by distance within each sector of a few points."""
     rows, label, start, rays = out
     n = len(points)
     sectors = len(start) - 1

@@ -1,19 +1,20 @@
 """The distance-region model (Eq. 10-12): exact nearest neighbours on a sorted distance axis.
 
-1. T1 carries the new scan's points into the reference frame: the virtual frame S_new (Eq. 10, 11).
-2. Reference and virtual points are ordered by their distance from the reference's origin and merged: the fused sequence
-   S_fus (Eq. 12, Fig. 2b), with the light points on the same axis.
-3. From each virtual point ("the current data centre") the search walks to both ends of the axis. It may stop as soon as
-   the next distance differs from the point's own by more than the best pair found so far, because
-   ``|r_p - r_q| <= |p - q|``: what has not been visited cannot be nearer, so the result is exact.
+1. T1 transforms the new scan's points into the reference frame: the virtual frame S_new (Eq. 10, 11).
+2. Reference and virtual points are sorted by their distance from the reference's origin and merged. This is the fused
+sequence S_fus (Eq. 12, Fig. 2b), with the light points on the same axis.
+3. From each virtual point ("the current data centre") the search walks to both ends of the axis. It stops when the next
+distance differs from the point's own by more than the best pair. Because ``|r_p - r_q| <= |p - q|``, no unvisited point
+can be nearer: the result is exact.
 
-That is :func:`fuse` and :func:`pair_fused`, the paper's form, on a single axis. A wall is a pile of equal distances,
-and there the single axis visits much of it. In the ring x sector form (:mod:`estimator.scan_matching.distance_axis`)
-each sector has an axis of its own; a sector is left out when the ray that bounds it, or the part of that ray inside its
-ring, is farther away than the best pair. Still exact; see :mod:`estimator.scan_matching.nearest_neighbour`.
+:func:`fuse` and :func:`pair_fused` are the paper's form, on a single axis. The points of a wall have similar distances,
+and there the single axis visits many of them. In the ring x sector form (:mod:`estimator.scan_matching.distance_axis`)
+each sector has its own axis. A sector is skipped when its boundary ray is farther away than the best pair. The part of
+that ray inside the sector's ring gives a sharper test. This is exact too; see
+:mod:`estimator.scan_matching.nearest_neighbour`.
 
-Both forms also return a bound that no other point comes closer than. A point that has moved by less than half the
-difference to its partner's distance keeps its partner without being looked up (its safe radius).
+Both forms also return a lower bound for the distance of every other point. The safe radius of a point is half the
+difference between that bound and its partner's distance. Within it, a moved point keeps its partner without a search.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from estimator.scan_matching.nearest_neighbour import walk
 
 
 class Kind(IntEnum):
-    """What stands on the fused axis: circles, triangles and filled circles of Fig. 2b."""
+    """Kind of a point on the fused axis: circles, triangles and filled circles of Fig. 2b."""
 
     VIRTUAL = 0
     REFERENCE = 1
@@ -41,15 +42,17 @@ class Kind(IntEnum):
 
 @dataclass(slots=True, eq=False)
 class Fused:
-    """S_fus (Eq. 12): virtual, reference and light points in the order of their distance from the reference's origin.
+    """S_fus (Eq. 12): virtual, reference and light points sorted by their distance from the reference's origin.
 
     Attributes:
-        kind, member, distance: (n,) per place on the axis: :class:`Kind`, index among the points of that kind (rows of
-            the axis; the new scan's points; lights), distance in metres.
-        virtual: (m, 2) the new scan's points relative to the axis centre.
-        below: (m,) how many reference rows are nearer to the origin than each of them: where its search begins.
-        kept: (m,) whether it was measured within L; order: (m,) the virtual points by distance.
-        rows: reference rows within L.
+        kind: (n,) :class:`Kind` of each entry on the axis.
+        member: (n,) index among the points of that kind: rows of the axis, points of the new scan, or lights.
+        distance: (n,) in m.
+        virtual: (m, 2) the new scan's points relative to the axis centre, m.
+        below: (m,) number of reference rows nearer to the origin than each of them: where its search begins.
+        kept: (m,) whether it was measured within L.
+        order: (m,) the virtual points by distance.
+        rows: number of reference rows within L.
     """
 
     kind: npt.NDArray[np.uint8]
@@ -65,10 +68,10 @@ class Fused:
 def fuse(axis: Axis, points: Array, T: Array, far: float = np.inf, before: Fused | None = None) -> Fused:
     """Virtual frame and fused sequence (Eq. 11, 12) of the new scan's points (m, 2), in its lidar's frame.
 
-    ``T``: pose of the new lidar in the axis' frame (x, y, yaw). ``far``: L of the quality filter; the axis is cut
-    behind L for reference points and behind ``L + |t|`` for virtual ones (none behind it can have been measured within
-    L), and what remains of these is checked. ``before``: the sequence of the iteration before; its order nearly
-    holds.
+    ``T``: pose of the new lidar in the axis' frame (x, y, yaw). ``far``: L of the quality filter. The axis is cut
+    beyond L for reference points and beyond ``L + |t|`` for virtual ones. No virtual point beyond that can have been
+    measured within L; the others are checked. ``before``: the sequence of the previous iteration, whose order is nearly
+    the same.
 
     Raises:
         ValueError: the axis has sectors; the paper's form needs the single one (``build_axis(..., sectors=1)``).
@@ -126,7 +129,7 @@ def merge(
 def walk_all(
     rows: Array, virtual: Array, below: Ints, kept: npt.NDArray[np.bool_], out: tuple[Ints, Array, Ints]
 ) -> None:
-    """:func:`walk` for all virtual points, each from its own place on the fused axis."""
+    """:func:`walk` for all virtual points, each from its own position on the fused axis."""
     row, d2, visits = out
     n = len(rows)
     for i in range(len(virtual)):
@@ -137,9 +140,9 @@ def walk_all(
 
 
 def pair_fused(axis: Axis, fused: Fused, bound: float = np.inf) -> tuple[Ints, Array, Ints]:
-    """Nearest reference row of every virtual point, its distance, and how many points were visited for it.
+    """Nearest reference row of each virtual point, its distance (m), and the number of points visited for it.
 
-    Row -1 where none is nearer than ``bound`` (the distance is then ``bound``) or the point is behind L.
+    Row -1 and distance ``bound`` where none is nearer than ``bound``, or where the point is beyond L.
     """
     m = len(fused.virtual)
     row, d2, visits = np.full(m, -1), np.full(m, bound * bound), np.zeros(m, np.int64)

@@ -1,12 +1,12 @@
-"""Point-to-line ICP (Eq. 13) on the distance-region axis, with the prediction weighted in at every iteration (Eq. 14).
+"""Point-to-line ICP (Eq. 13) on the distance-region axis, with the prediction weighted in at each iteration (Eq. 14).
 
-Eq. 14 adds transforms as matrices, which leaves the group of rigid motions; here the weight is the matrix
-``W = (L1 + L2)^-1 L1`` of the two witnesses' information (L1 of the prediction T1, L2 of the laser T2), so that a
-corridor takes its long axis from the prediction and a room takes everything from the laser.
+Eq. 14 adds transforms as matrices, which leaves the group of rigid motions. Here the weight is the matrix ``W = (L1 +
+L2)^-1 L1``. L1 is the information of the prediction T1, L2 that of the lidar T2. So in a corridor the prediction
+determines the long axis, and in a room the lidar determines everything.
 
-The laser's information is not allowed to flatter itself. Normals are fitted to noisy points, so a smooth wall seems to
-hold a little along itself as well; the expected part of that is known (each normal carries the variance of its
-direction) and is subtracted, and a direction in which nothing certain remains is left to the prediction.
+The lidar's information must not be too large. Normals are fitted to noisy points, so a smooth wall seems to constrain
+the pose along itself as well. The expected size of that part is known, because each normal has the variance of its
+direction; it is subtracted. A direction without significant information is left to the prediction.
 """
 
 from __future__ import annotations
@@ -19,48 +19,56 @@ from estimator.numerics.symmetric3 import eigen3, positive, solve3
 from estimator.scan_matching.nearest_neighbour import glance, nearest, search
 
 GRAZE = 0.2
-"""Part of the range noise that remains across a surface met at a grazing angle: footprint, roughness, bearing."""
+"""Share of the range noise across a surface that remains at a grazing angle: footprint, roughness, bearing error."""
 
 ASKEW = 0.6
-"""Sine of the largest angle between a point's surface and its partner's, 37 deg: leaves room for a wrong heading."""
+"""Sine of the largest angle between the surfaces of a point and its partner, 37 deg; this allows a heading error."""
 
 SHRINK = 2.0
-"""Robust scale in units of what the last step moved a point."""
+"""Robust scale in units of a point's displacement in the last step."""
 
 INLIERS, PAIRS, WEIGHTS, SQUARES, SETTLED, LENGTH2, DAMPING = range(15, 22)
-"""Places in the sums behind the normal equations; ``SUMS`` in all."""
+"""Indices of further entries in the sums of the normal equations; ``SUMS`` entries in all."""
 
 SUMS = 22
 
 AT_X, AT_Y, AT_YAW, SCALE, GATE, STRIDE, FITTED, PAIRED, WEIGHED, SQUARED, STEP2, DAMPED, SOUGHT = range(13)
-"""Columns of the trace, one row an iteration: the pose it began at (relative to the axis centre), robust scale, gate,
-every how many points it took; inliers, pairs, weights and squares as in its sums; squared length of its step in its own
-deviations and damping (0 if it made none); how many points were looked up because they had left their safe radius."""
+"""Columns of the trace, one row an iteration; STRIDE is the point stride, SOUGHT the number of searches.
+
+AT_X, AT_Y, AT_YAW: initial pose, relative to the axis centre. SCALE, GATE: robust scale and gate, m. FITTED to SQUARED:
+inliers, pairs, weights and squares as in its sums. STEP2, DAMPED: squared step length in sigma, and damping; 0 without
+a step. A search runs for each point that has left its safe radius.
+"""
 
 TRACE = 13
 
 Reference = tuple[Array, Ints, Array, Array]
-"""Rows, start and rays of the axis, and per row normal x, y, variance of the normal's direction, weight."""
+"""Rows, start and rays of the axis; per row the normal x, y, the variance of the normal's direction, and the weight."""
 
 PX, PY, EX, EY, TX, TY = range(6)
-"""Rows of the queries (6, n): place, unit vector towards the lidar, tangent, all in the base frame."""
+"""Rows of the queries (6, n): position, unit vector towards the lidar, tangent, all in the base frame."""
 
 NX, NY, OFFSET, SLOPE, WEIGHT = range(5)
-"""Rows of the partners' lines (5, n): normal, its product with a place on the line, variance of the normal's direction,
-weight (0: no partner)."""
+"""Rows of the partners' lines (5, n): normal, its product with a point on the line, direction variance, weight.
+
+A weight of 0 marks a query without a partner.
+"""
 
 Memory = tuple[Ints, Ints, Array, Array]
-"""Per query: its partner (a row, or -1); the row found when last sought; where the query was then (x, y) and how far,
-squared, it may move until another row can be nearest; the partners' lines (5, n)."""
+"""Per query: its partner (a row, or -1); the row of its last search; a safe radius; the partners' lines (5, n).
+
+The third array holds the query's position (x, y) at the last search. Its third column is the squared distance that the
+query may move until another row can be nearest.
+"""
 
 
 def memory_of(queries: int) -> Memory:
-    """Memory of queries that have never been sought."""
+    """Memory of queries that have not been searched yet."""
     return np.full(queries, -1), np.full(queries, -1), np.zeros((queries, 3)), np.zeros((5, queries))
 
 
 def paired(points: Array, reference: Reference, row: Array) -> Ints:
-    """Row of the axis that each of the points (n, 4) was paired with in the iteration of a trace's row, or -1."""
+    """Row of the axis paired with each point (n, 4) in the iteration of a trace's row, or -1."""
     coarse = int(row[STRIDE])
     body, memory = np.empty((6, len(points))), memory_of(len(points))
     lay_out(points, 0.0, 0.0, coarse, body)
@@ -72,9 +80,9 @@ def paired(points: Array, reference: Reference, row: Array) -> Ints:
 
 @kernel("f8(f8[:, ::1], f8, f8, i8, f8[:, ::1])")
 def lay_out(points: Array, ex: float, ey: float, coarse: int, body: Array) -> float:
-    """Points (n, 4) as columns, every ``coarse``-th of them first, seen from the lidar at (ex, ey).
+    """Write points (n, 4) as columns, every ``coarse``-th of them first, with directions to the lidar at (ex, ey).
 
-    Returns their root mean square distance from it: metres that they move per radian.
+    Returns their root mean square distance from the lidar: metres of displacement per radian.
     """
     n, at, square = len(points), 0, 0.0
     for first in range(coarse):
@@ -92,7 +100,7 @@ def lay_out(points: Array, ex: float, ey: float, coarse: int, body: Array) -> fl
 
 @kernel("void(f8[:, ::1], f8[:, ::1], i8, i8, f8[:, ::1])")
 def hold(rows: Array, lines: Array, row: int, i: int, held: Array) -> None:
-    """Write the line of a row (-1: none) where the sums of query ``i`` look for it."""
+    """Copy the line of a row (-1: none) to column ``i`` of ``held``, where :func:`sum_up` reads it."""
     if row < 0:
         held[WEIGHT, i] = 0.0
         return
@@ -107,9 +115,9 @@ def hold(rows: Array, lines: Array, row: int, i: int, held: Array) -> None:
     " Tuple((i8[::1], i8[::1], f8[:, ::1], f8[:, ::1])))"
 )
 def pair_up(body: Array, reference: Reference, T: Array, gate2: float, count: int, memory: Memory) -> int:
-    """Step 1 of Sect. 4.2: the nearest row within the gate for the first ``count`` queries at pose ``T``.
+    """Step 1 of Sect. 4.2: nearest row within the gate for each of the first ``count`` queries at pose ``T``.
 
-    A query that has not left its safe radius keeps its row without being looked up; returns how many were.
+    A query within its safe radius keeps its row without a search. Returns the number of searches.
     """
     rows, start, rays, lines = reference
     partner, found, safe, held = memory
@@ -141,12 +149,12 @@ def pair_up(body: Array, reference: Reference, T: Array, gate2: float, count: in
 def sum_up(body: Array, held: Array, T: Array, scale: float, queries: int, sums: Array) -> None:
     """Step 2 of Sect. 4.2: the normal equations of point-to-line over the pairs of the first queries.
 
-    A pair does not count where the point would be seen from behind the surface (the other side of a thin wall), or lies
-    askew to it (the other wall of a corner).
-    ``scale``: robust scale, m. ``sums``: 6 of the information, 6 of its expected noise part, 3 of the gradient,
-    inliers, pairs, robust weights and squares (m^2, scaled to what they would be as range noise).
+    A pair does not count if the point sees the surface from behind (the other side of a thin wall). Nor does it count
+    where the two surfaces lie at a large angle (the other wall of a corner).
+    ``scale``: robust scale, m. ``sums``: 6 of the information, 6 of its expected noise part, 3 of the gradient; then
+    inliers, pairs, robust weights, and squares (m^2, scaled to range noise).
 
-    Written without branches, over columns, so that the compiler may take several pairs at a time.
+    The loop has no branches and runs over columns, so that the compiler can vectorise it.
     """
     px, py, ex, ey, tx, ty = body[PX], body[PY], body[EX], body[EY], body[TX], body[TY]
     nx, ny, offset, slope, weight = held[NX], held[NY], held[OFFSET], held[SLOPE], held[WEIGHT]
@@ -186,9 +194,9 @@ def sum_up(body: Array, held: Array, T: Array, scale: float, queries: int, sums:
 
 @kernel("void(f8[::1], f8, f8[:, ::1], f8[:, ::1])", inner=True)
 def trusted(sums: Array, k: float, H: Array, keep: Array) -> None:
-    """The part of the information that is not the normals' noise, times ``k``, and the projector onto what it holds.
+    """Information without the normals' noise, times ``k``, to ``H``; projector on its directions to ``keep``.
 
-    A direction is held when its information is more than twice the part that noise alone explains; the test needs no
+    A direction counts when its information is more than twice the part that noise alone explains. That test needs no
     scaling of metres against radians. Only where it fails are directions separated, with yaw in units of the points'
     mean lever.
     """
@@ -225,7 +233,7 @@ def trusted(sums: Array, k: float, H: Array, keep: Array) -> None:
 
 @kernel("f8(f8[:, ::1], f8[::1])")
 def mean_lever(points: Array, eye: Array) -> float:
-    """Root mean square distance of the points from the lidar: metres that they move per radian."""
+    """Root mean square distance (m) of the points from the lidar: metres of displacement per radian."""
     square = 0.0
     for i in range(len(points)):
         square += (points[i, 0] - eye[0]) ** 2 + (points[i, 1] - eye[1]) ** 2
@@ -234,7 +242,7 @@ def mean_lever(points: Array, eye: Array) -> float:
 
 @kernel("f8(f8[::1], f8[:, ::1], f8[::1])", inner=True)
 def between(u: Array, A: Array, v: Array) -> float:
-    """``u' A v`` of two steps (3,), as the information A (3, 3) weighs them."""
+    """``u' A v`` of two steps (3,) with the information A (3, 3)."""
     total = 0.0
     for i in range(3):
         for j in range(3):
@@ -244,10 +252,10 @@ def between(u: Array, A: Array, v: Array) -> float:
 
 @kernel("void(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8, f8[:, ::1])")
 def see_across(points: Array, reference: Reference, T: Array, scale: float, out: Array) -> None:
-    """How much surface the points (n, 4) show across each direction at pose ``T``, and how much of it fits.
+    """Write the amount of visible and of matching surface across each direction at pose ``T``, from the points (n, 4).
 
-    ``out`` (2, 3): sums of xx, xy, yy over the unit vectors across the tangents; of all points, and of those with a
-    partner whose line lies within two ``scale`` and along whose line they run.
+    ``out`` (2, 3): sums of xx, xy, yy over the unit vectors across the tangents. Row 0 is over all points. Row 1 is
+    over those whose partner's line lies within two ``scale`` and runs along the same direction.
     """
     rows, start, rays, lines = reference
     c, s, gate = np.cos(T[2]), np.sin(T[2]), max(6.0 * scale, 0.1)
@@ -278,14 +286,14 @@ def see_across(points: Array, reference: Reference, T: Array, scale: float, out:
 def iterate(
     points: Array, reference: Reference, T: Array, L1: Array, how: Array, out: tuple[Array, Array, Array]
 ) -> int:
-    """Iterate Eq. 13-14 from ``T`` (relative to the axis centre), which is moved in place; the number of iterations.
+    """Iterate Eq. 13-14 from ``T`` (relative to the axis centre, changed in place); returns the number of iterations.
 
-    The robust scale shrinks from twice what the prediction's uncertainty moves a point to a few times the noise, not
-    faster than the steps do; until an iteration has been made near the last scale every fourth point will do. A step
-    that turns back on the one before is halved: pairs may alternate between two sets.
-    ``how``: lidar in the base frame (x, y), iteration cap, gate, last scale, noise, least step in its own deviations,
-    stride while coarse. ``out``: the laser's information (3, 3); the sums of the last pass with SETTLED, LENGTH2
-    (squared length of the last step in its own deviations) and DAMPING; the trace (cap, TRACE), a row an iteration.
+    The robust scale starts at twice the displacement of a point by the prediction's uncertainty. It shrinks to a few
+    times the noise, not faster than the steps do. Every ``coarse``-th point is used until an iteration near the last
+    scale. A step that reverses the previous one is halved, because pairs may alternate between two sets.
+    ``how``: lidar in the base frame (x, y), iteration cap, gate, last scale, noise, smallest step in sigma, coarse
+    stride. ``out``: the lidar's information (3, 3); the sums of the last pass with SETTLED, LENGTH2 (squared length of
+    the last step in sigma) and DAMPING; the trace (cap, TRACE), a row an iteration.
     """
     H, sums, trace = out
     n, coarse = len(points), int(how[7])

@@ -1,4 +1,4 @@
-"""Line elements: what a scan's points say about the surfaces they lie on."""
+"""Line elements of a scan: surface point, normal and its direction variance, fitted to the neighbours of each point."""
 
 from __future__ import annotations
 
@@ -9,18 +9,23 @@ from estimator.numerics.jit import kernel
 from estimator.scan_matching.deskew import ScanPoints
 
 REACH_M, REACH_SIGMAS = 0.12, 8.0
-"""Neighbours this near are used, or within so many times the noise: long enough for a direction out of range noise,
-short enough for furniture. A window that noise itself cuts short picks the points that lie wrong in the same way."""
+"""Radius (m) of the neighbours in a fit, or that many times the noise.
+
+It is long enough for a direction despite range noise, and short enough for furniture. A window that the noise itself
+cuts short selects points with the same error.
+"""
 
 SPACING_M, OFF_M = 0.018, 0.06
-"""Along a surface a line is taken every so often: a thirteenth of what it is fitted to. What lies farther off the last
-line is another surface."""
+"""Spacing (m) of lines along a surface, a thirteenth of the fitted length.
+
+OFF_M: distance (m) off the last line beyond which a point belongs to another surface.
+"""
 
 FEW, GAP_M = 2, 0.5
-"""Where beams are sparser than that, so many neighbours on either side, if they are no farther away than this."""
+"""Neighbours on either side where beams are sparser, and their largest distance (m)."""
 
 STEEPEST = 0.03
-"""Largest variance of a direction worth having, rad^2 (10 deg)."""
+"""Largest variance of a usable direction, rad^2 (10 deg)."""
 
 FLAT = 0.03
 """Largest share of a line's variance across it, unless range noise explains it."""
@@ -47,11 +52,12 @@ def neighbours(xy: Array, i: int, reach: float) -> tuple[int, int]:
 
 @kernel("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])", inner=True)
 def add_up(xy: Array, eye: Array, sums: Array, columns: Array) -> None:
-    """Running sums of x, y, xx, xy, yy relative to the ``eye``: row i of ``sums`` (n + 1, 5) is over i points.
+    """Write running sums of x, y, xx, xy, yy relative to the ``eye``: row i of ``sums`` (n + 1, 5) is over i points.
 
     The points (n, 2) are also written as ``columns`` (2, n).
 
-    A surface 80 m away loses 3e-10 m^2 of its variance to rounding, a thousandth of what a tenth of a millimetre makes.
+    At a range of 80 m, rounding removes 3e-10 m^2 from the variance. That is a thousandth of the effect of a tenth of a
+    millimetre.
     """
     sx = sy = sxx = sxy = syy = 0.0
     for i in range(len(xy)):
@@ -65,7 +71,7 @@ def add_up(xy: Array, eye: Array, sums: Array, columns: Array) -> None:
 
 @kernel("Tuple((f8, f8, f8, f8))(f8[:, ::1], i8, i8)", inner=True)
 def line_through(sums: Array, low: int, high: int) -> tuple[float, float, float, float]:
-    """Total-least-squares line of the points [low, high): normal (x, y), variance across it and along it."""
+    """Total-least-squares line of the points [low, high): normal (x, y), variance across it and along it (m^2)."""
     part = 1.0 / (high - low)
     mx, my = (sums[high, 0] - sums[low, 0]) * part, (sums[high, 1] - sums[low, 1]) * part
     cxx = (sums[high, 2] - sums[low, 2]) * part - mx * mx
@@ -84,9 +90,9 @@ def line_through(sums: Array, low: int, high: int) -> tuple[float, float, float,
 
 @kernel("f8(f8[:, ::1], i8, i8, Tuple((f8, f8, f8, f8)))", inner=True)
 def offset_on_line(columns: Array, low: int, high: int, at: tuple[float, float, float, float]) -> float:
-    """Offset along the normal, at the point ``at`` (x, y, normal), of a parabola through the points [low, high).
+    """Offset (m) along the normal of a parabola through the points [low, high), at the point ``at`` (x, y, normal).
 
-    A parabola and not a line: a line through points of a column would lie inside it.
+    A line through the points of a column would lie inside it; a parabola does not.
     """
     x, y, nx, ny = at
     m1 = m2 = m3 = m4 = v0 = v1 = v2 = 0.0
@@ -113,7 +119,7 @@ def offset_on_line(columns: Array, low: int, high: int, at: tuple[float, float, 
 
 @kernel("void(f8[:, ::1], i8)", inner=True)
 def measure_runs(lines: Array, count: int) -> None:
-    """Write into column 5 how far apart the ends of each unbroken run of lines are."""
+    """Write into column 5 the distance (m) between the ends of each unbroken run of lines."""
     begin = 0
     for i in range(1, count + 1):
         if i < count and (lines[i, 0] - lines[i - 1, 0]) ** 2 + (lines[i, 1] - lines[i - 1, 1]) ** 2 < GAP_M * GAP_M:
@@ -125,10 +131,10 @@ def measure_runs(lines: Array, count: int) -> None:
 
 @kernel("i8(f8[:, ::1], f8[::1], f8, f8[:, ::1])", aside=True)
 def fit_lines(xy: Array, eye: Array, sigma: float, lines: Array) -> int:
-    """A line through the surroundings of each point, left out where they are none; the number found.
+    """Fit a line to the neighbours of each point, where they lie on a surface; returns the number of lines.
 
-    A row of ``lines`` is the point moved onto its surface (x, y), the normal towards the ``eye`` (x, y), the variance
-    of the normal's direction in rad^2, and the extent of the unbroken run it belongs to in m.
+    A row of ``lines`` begins with the point on its surface (x, y) and the normal towards the ``eye``. Then follow the
+    variance of the normal's direction (rad^2) and the extent of its unbroken run (m).
     """
     found, reach = 0, max(REACH_M, REACH_SIGMAS * sigma)
     sums, columns = np.empty((len(xy) + 1, 5)), np.empty((2, len(xy)))

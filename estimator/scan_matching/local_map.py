@@ -1,9 +1,9 @@
-"""The bounded recent map a scan is matched against: line elements on one distance-region axis.
+"""The local map: recent line elements around the robot on one distance-region axis, bounded in number.
 
-A keyframe's lines are merged into those already there, so that a wall seen ten times is one row of elements with a
-tenth of the variance, and not ten rows among which the nearest one always flatters the match. What the recent
-keyframes have not seen again is dropped, and so is what they looked through (people, doors). The cost of a match thus
-depends on what is in view, not on how long the robot has driven.
+A keyframe's lines are merged into existing elements. A wall seen ten times is then one row of elements with a tenth of
+the variance. Ten separate rows would bias the match, because the nearest one always fits too well. Elements not seen in
+the recent keyframes are removed, and so are those seen through (people, doors). The cost of a match therefore depends
+on the visible area, not on the time driven.
 """
 
 from __future__ import annotations
@@ -23,39 +23,44 @@ from estimator.scan_matching.distance_axis import Axis, build_axis
 from estimator.scan_matching.nearest_neighbour import nearest
 
 X, Y, NX, NY, SLOPE, WEIGHT, SEEN, STRIKES = range(8)
-"""Columns of an element: place, normal towards the sensor, variance of the normal's direction (rad^2), scans averaged,
-number of the update that saw it last, how often it was looked through since."""
+"""Columns of an element: position, normal towards the sensor, direction variance (rad^2), and its counters.
+
+WEIGHT: scans averaged. SEEN: number of the last update that saw it. STRIKES: number of times seen through since.
+"""
 
 WIDTH = 8
 MARGIN = 0.1
-"""Metres, beyond five times the range noise, by which a beam must differ to speak for or against an element."""
+"""Margin (m), beyond five times the range noise, of a beam that ends on an element or beyond it."""
 
 SOLID_M, UNPROVED = 0.5, 0.1
-"""A run longer than this is structure; what is smaller (legs of people, of chairs) counts little until seen again."""
+"""A run longer than this (m) is structure; a smaller one (legs of people, of chairs) has the second value as weight."""
 
 SAMPLES = 400
-"""Elements, and points, that are asked at least whether they speak against a pose."""
+"""Approximate number of elements, and of points, in the free-space test of a pose."""
 
 HIT = int(Beam.HIT)
 UNSEEN: Beams = (np.empty(0), np.empty(0), np.empty(0, np.uint8))
 
 WAVY = 0.03
-"""Radians by which the direction of a surface is never known better: walls, skirtings and doors are not flat, by the
-same in every scan. A corridor must not be told along its axis by the unevenness of its walls."""
+"""Smallest sigma of a surface direction, rad: walls, skirtings and doors are not flat, and in every scan alike.
+
+Without it the unevenness of its walls would seem to determine the pose along a corridor.
+"""
 
 ALIKE = 0.94
-"""Least cosine between the normals of elements that are merged: 20 deg."""
+"""Smallest cosine between the normals of merged elements: 20 deg."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapSettings:
-    """The local map.
+    """Settings of the local map.
 
     Attributes:
-        spacing_m: elements closer than this, or than half the beam spacing at their range, are one.
-        age: updates an element survives unseen. weight: scans it averages at most.
-        capacity: most elements; the oldest go first. strikes: times it may be looked through per scan
-            averaged.
+        spacing_m: elements closer than this, or than half the beam spacing at their range, are merged.
+        age: updates for which an element survives without being seen.
+        weight: most scans in its average.
+        capacity: most elements; the oldest are removed first.
+        strikes: times it may be seen through, per scan averaged.
     """
 
     spacing_m: float = 0.025
@@ -66,7 +71,7 @@ class MapSettings:
 
 
 class PlacedScan(Protocol):
-    """A kept scan with the pose it was taken from, as `estimator.mapping.keyframe.Keyframe` is one."""
+    """A kept scan with its pose; `estimator.mapping.keyframe.Keyframe` implements it."""
 
     @property
     def T_odom_keyframe(self) -> Array:
@@ -82,19 +87,19 @@ class PlacedScan(Protocol):
 
     @property
     def bearing_rad(self) -> Array:
-        """Bearings in the lidar frame as the device gives them."""
+        """Bearings in the lidar frame, as the device measures them."""
 
     @property
     def virtual(self) -> Virtual | None:
-        """What light alone said at that instant, None where it said nothing good."""
+        """The light solution at that instant, None where it is not valid."""
 
     def beams(self) -> Beams:
-        """Beams as seen from the end of the scan."""
+        """Beams in the lidar's frame at the end of the scan."""
 
 
 @dataclass(slots=True, eq=False)
 class LocalMap:
-    """Elements (n, WIDTH) in the odom frame, and their axis; ``lines`` (normal x, y, slope, weight) follow its rows."""
+    """Elements (n, WIDTH) in the odom frame and their axis; ``lines`` (normal x, y, slope, weight) follow its rows."""
 
     elements: Array
     axis: Axis
@@ -116,7 +121,7 @@ def absorb(
     how: tuple[float, float, float, float, float],
     count: int,
 ) -> int:
-    """Merge lines (base frame) into the elements [0, count), append what is new; the new count.
+    """Merge lines (base frame) into the elements [0, count) and append new ones; returns the new count.
 
     ``axis``: rows, label, start, rays of the elements. ``pose``: T_odom_base (3), axis centre (2), lidar in the base
     frame (2). ``how``: update number, spacing, half a beam spacing in rad, residual noise, largest weight.
@@ -171,10 +176,10 @@ def look_at(
     stride: int,
     said: npt.NDArray[np.int8],
 ) -> None:
-    """What a scan from ``eye`` (x, y, yaw) says of every ``stride``-th element: 1 there, -1 looked through, 0 nothing.
+    """Write the visibility of every ``stride``-th element in a scan from ``eye`` (x, y, yaw) to ``said``.
 
-    An element is looked through when the beam at its bearing and both neighbours go beyond it; it is there when one of
-    them ends on it. What stands before it, lies outside the view or is met at a grazing angle is not judged.
+    1: a beam at its bearing, or a neighbouring one, ends on it. -1: it is seen through, as that beam and both
+    neighbours end beyond it. 0: not judged; it is hidden, outside the field of view, or at a grazing angle.
     """
     bearing, distance, kind = beams
     n = len(bearing)
@@ -208,12 +213,12 @@ def look_at(
 
 
 def empty(origin: Array) -> LocalMap:
-    """A map with nothing in it."""
+    """An empty map."""
     return LocalMap(np.empty((0, WIDTH)), build_axis(np.empty((0, 2)), origin), np.empty((0, 4)))
 
 
 def update(local: LocalMap, frame: PlacedScan, lines: Array, settings: MapSettings, sigma: float) -> LocalMap:
-    """The map after a keyframe with these lines (base frame): merged, aged, indexed around the place of its lidar."""
+    """The map after a keyframe with these lines (base frame): merged, aged, indexed around its lidar's position."""
     number, count, margin = local.updates + 1, len(local.elements), MARGIN + 5.0 * sigma
     fresh = lines if local.newest is None else standing(frame, lines, local.newest, margin)
     elements = np.empty((count + len(fresh), WIDTH))
@@ -234,7 +239,7 @@ def update(local: LocalMap, frame: PlacedScan, lines: Array, settings: MapSettin
 
 
 def standing(frame: PlacedScan, lines: Array, before: PlacedScan, margin: float) -> Array:
-    """Lines of a keyframe that do not stand where the one before saw nothing: what has just moved in is left out."""
+    """Lines of a keyframe without those where the previous keyframe saw free space: objects that have just moved in."""
     points = np.zeros((len(lines), 4))
     points[:, :2] = se2.apply(frame.T_odom_keyframe, lines[:, :2])
     said = np.empty(len(points), np.int8)
@@ -244,7 +249,7 @@ def standing(frame: PlacedScan, lines: Array, before: PlacedScan, margin: float)
 
 @kernel("void(f8[:, ::1], i8[::1], f8[:, ::1])")
 def lines_along(elements: Array, label: Ints, lines: Array) -> None:
-    """Normal, slope and weight of the elements in the order of the axis; the weight as the share of a scan's noise."""
+    """Write normal, slope and weight of the elements in axis order; the weight as a share of one scan's noise."""
     for i in range(len(label)):
         j = label[i]
         lines[i, 0], lines[i, 1], lines[i, 2] = elements[j, NX], elements[j, NY], elements[j, SLOPE] + WAVY * WAVY
@@ -252,7 +257,7 @@ def lines_along(elements: Array, label: Ints, lines: Array) -> None:
 
 
 def index(elements: Array, origin: Array, number: int, newest: PlacedScan | None) -> LocalMap:
-    """Order elements on the axis around ``origin``."""
+    """Local map with the elements on an axis around ``origin``."""
     axis = build_axis(elements[:, :2], origin)
     lines = np.empty((len(elements), 4))
     lines_along(np.ascontiguousarray(elements), axis.label, lines)
@@ -263,7 +268,7 @@ def index(elements: Array, origin: Array, number: int, newest: PlacedScan | None
 def speaking_against(
     elements: Array, eye: Array, beams: Beams, before: Array, beams_before: Beams, margin: float
 ) -> float:
-    """Share of the evidence that speaks against a scan from ``eye``; one from ``before`` has looked about earlier."""
+    """Share of the tested evidence that contradicts a scan from ``eye``; ``before`` is the pose of an earlier scan."""
     step = max(1, len(elements) // SAMPLES)
     said = np.zeros(len(elements), np.int8)
     look_at(elements, eye, beams, margin, step, said)
@@ -294,18 +299,18 @@ def speaking_against(
 
 
 def looked_through(local: LocalMap, T_odom_lidar: Array, beams: Beams, sigma: float) -> float:
-    """Share of the elements in view that a scan from this pose looks through, of about 400 samples.
+    """Share of the elements in view that a scan from this pose sees through, of about 400 samples.
 
-    Half of what `contradicted` counts: whoever steps up hangs in space, but opens no walls.
+    This is half of the evidence of `contradicted`: a person who comes close stands in free space, but opens no walls.
     """
     return speaking_against(local.elements, T_odom_lidar, beams, T_odom_lidar, UNSEEN, MARGIN + 5.0 * sigma)
 
 
 def contradicted(local: LocalMap, T_odom_lidar: Array, beams: Beams, sigma: float) -> float:
-    """Share of the evidence that speaks against a scan being from this pose, of about 400 + 400 samples.
+    """Free-space violation of a scan from this pose, of about 400 + 400 samples.
 
-    Evidence is of two kinds: elements in view that the scan looks through, and points of the scan that hang in space
-    which the newest keyframe has looked through.
+    It counts elements in view that the scan sees through. It also counts scan points where the newest keyframe saw free
+    space.
     """
     newest, margin = local.newest, MARGIN + 5.0 * sigma
     before, beams_before = (T_odom_lidar, UNSEEN) if newest is None else (newest.T_odom_lidar, newest.beams())

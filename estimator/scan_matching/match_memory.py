@@ -1,4 +1,4 @@
-"""What scan matching remembers from scan to scan: the local map, the latest match, and what residuals have shown."""
+"""Scan-matching state between scans: the local map, the latest match, and learned noise and residual correlation."""
 
 from __future__ import annotations
 
@@ -17,15 +17,19 @@ class MatchMemory:
     """State of scan matching.
 
     Attributes:
-        local_map: what the next scan is matched against, None before the first keyframe.
-        t_scan, T_odom_scan: instant (s) and pose of the latest scan. t_match: instant of the latest that matched.
-        t_newest_scan: end of the latest scan's sweep, s. bearing_rad: the latest bearings found in order.
-        scans_since_keyframe: scans since the newest keyframe. failures: scans in a row that did not match.
-        restarts: how often the local map was begun anew because nothing fitted the old one.
-        noise_m: range noise learned from residuals, m; 0 before the first. residual_sums: (2,) fading sums over
-            neighbouring residuals, product and squares (`estimator.scan_matching.residual_correlation`).
-        unheld_s: for how long the pose has been carried on along a direction that no match held, s.
-        steps: way and turn by the prediction, in units of the keyframe distances.
+        local_map: map for the next scan, None before the first keyframe.
+        t_scan, T_odom_scan: instant (s) and pose of the latest scan.
+        t_match: instant of the latest scan that matched, s.
+        t_newest_scan: end of the latest scan, s.
+        bearing_rad: the latest bearings that passed validation.
+        scans_since_keyframe: scans since the newest keyframe.
+        failures: consecutive scans that did not match.
+        restarts: number of local map restarts because nothing fitted the old one.
+        noise_m: range noise learned from residuals, m; 0 before the first.
+        residual_sums: (2,) exponentially weighted sums over neighbouring residuals, product and squares
+            (`estimator.scan_matching.residual_correlation`).
+        unheld_s: duration of prediction along a degenerate direction, s.
+        steps: predicted path length and rotation, in units of the keyframe distances.
     """
 
     local_map: LocalMap | None = None

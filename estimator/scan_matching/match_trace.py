@@ -1,8 +1,8 @@
-"""One match re-run, iteration by iteration: its pairs, their residuals and weights.
+"""Repeats one match with a full trace, for plots: pairs, residuals and weights of each iteration.
 
-A match keeps a trace of a few numbers an iteration. Everything else follows from it and from what the matcher was asked
-with, because the kernels are deterministic; so a match costs nothing until somebody asks, and what is then told is what
-happened. Loaded by those who ask only.
+A match keeps a trace of a few numbers an iteration. The kernels are deterministic, so everything else follows from that
+trace and the arguments of the match. A match itself therefore spends no time on it, and the trace shows what happened.
+Only plots and tests import this module.
 """
 
 from __future__ import annotations
@@ -21,13 +21,15 @@ from estimator.scan_matching.scan_matcher import Asked, Attempt
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """The pairs of one iteration that have spoken, one row each.
+    """The pairs that counted in one iteration, one row each.
 
     Attributes:
-        point: index of the query in the attempt's points. element: index in the local map's elements.
+        point: index of the query in the attempt's points.
+        element: index in the local map's elements.
         residual_m: signed distance of the point from its partner, along the partner's normal (towards the sensor).
-        weight: robust weight, 0 to 1. square: its share of the iteration's sum of squares, m^2.
-        fits: it counts among the inliers.
+        weight: robust weight, 0 to 1.
+        square: its share of the iteration's sum of squares, m^2.
+        fits: whether it is an inlier.
     """
 
     point: Ints
@@ -40,7 +42,7 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Iteration:
-    """One iteration: the pose T_odom_base it began at, its row of the trace (`icp.TRACE` columns), its pairs."""
+    """One iteration: its initial pose T_odom_base, its row of the trace (`icp.TRACE` columns), its pairs."""
 
     T_odom_base: Array
     row: Array
@@ -49,7 +51,7 @@ class Iteration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """One attempt told again: ``what`` is "first", "trial" or "final" (the last two of a second opinion)."""
+    """One repeated attempt: ``what`` is "first", "trial" or "final" (the last two belong to a multi-start)."""
 
     what: str
     attempt: Attempt
@@ -57,7 +59,7 @@ class Told:
 
 
 def tell(asked: Asked | None) -> tuple[Told, ...]:
-    """Match again and tell every attempt; nothing where the matcher was not asked (no map, too few points)."""
+    """Repeat a match and return all attempts; empty where no matcher ran (no map, too few points)."""
     if asked is None:
         return ()
     view, local, prior, cap, settings = asked
@@ -68,14 +70,14 @@ def tell(asked: Asked | None) -> tuple[Told, ...]:
 
 
 def name_of(number: int, attempt: Attempt, view: scan_matcher.View) -> str:
-    """What an attempt was for: a second opinion's trials take few of the points, its last one all of them."""
+    """Name of an attempt: "first"; in a multi-start a "trial" uses few of the points, the "final" one all of them."""
     if number == 0:
         return "first"
     return "final" if attempt.view is view else "trial"
 
 
 def iterations_of(attempt: Attempt, local: LocalMap) -> tuple[Iteration, ...]:
-    """The iterations of an attempt, with their pairs, in order."""
+    """The iterations of an attempt with their pairs, in order."""
     axis, view = local.axis, attempt.view
     reference = (axis.rows, axis.start, axis.rays, local.lines)
     centre = np.array((axis.centre[0], axis.centre[1], 0.0))
@@ -90,9 +92,9 @@ def iterations_of(attempt: Attempt, local: LocalMap) -> tuple[Iteration, ...]:
 
 
 def pairs_at(body: Array, partners: tuple[LocalMap, Ints], trace: Array) -> Pairs:
-    """What each pair adds to the sums of the iteration that left this row of the trace.
+    """Contribution of each pair to the sums of the iteration that produced this row of the trace.
 
-    The matcher's own kernel is asked for one pair at a time, so that no second form of the model can differ from it.
+    The matcher's own kernel runs for one pair at a time, so that no second implementation can differ from it.
     """
     local, partner = partners
     T, scale = trace[: icp.AT_YAW + 1].copy(), trace[icp.SCALE]

@@ -1,7 +1,7 @@
-"""Exact nearest neighbours on the ring x sector form of the distance axis.
+"""Exact nearest-neighbour search on the ring x sector form of the distance axis.
 
-Each sector of the axis (:mod:`estimator.scan_matching.distance_axis`) has an axis of its own. A sector is left out when
-the ray that bounds it, or the part of that ray inside its ring, is farther away than the best pair.
+Each sector of the axis (:mod:`estimator.scan_matching.distance_axis`) has its own axis. A sector is skipped when its
+boundary ray is farther away than the best pair. The part of that ray inside the sector's ring gives a sharper test.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from estimator.numerics.jit import kernel
 from estimator.scan_matching.distance_axis import GROUP, Axis, sector_of
 
 GLANCE = 8
-"""Rows compared at first sight, without a branch."""
+"""Rows that the first comparison covers, without a branch."""
 
 
 SHORT = 64
-"""A group of at most this many rows is compared through; a longer one is searched along its axes."""
+"""A group of at most this many rows is compared in full; a longer one is searched along its axes."""
 
 
 PATIENCE = 16
-"""Points an axis of a sector is walked for; what then still remains is compared through, which costs less a point."""
+"""Points visited by a walk on a sector's axis; the rest is compared in full, which costs less per point."""
 
 
 @kernel("Tuple((i8, f8, f8, i8, i8))(f8[:, ::1], i8, i8, i8, f8, f8, Tuple((i8, f8, f8, i8)))", inner=True)
 def walk(
     rows: Array, low: int, high: int, at: int, qx: float, qy: float, best: tuple[int, float, float, int]
 ) -> tuple[int, float, float, int, int]:
-    """From place ``at`` of the axis [low, high), before which all rows are nearer to the origin, to both ends.
+    """Walk from ``at`` on the axis [low, high) to both ends; all rows before ``at`` are nearer to the origin.
 
-    ``best``: best row so far, its squared distance, a bound (squared) that no other row comes closer than, and how many
-    rows to visit at most. Returns the first three brought up to date, and the next row towards each end.
+    ``best``: best row so far, its squared distance, a lower bound (squared) for all others, and most rows to visit.
+    Returns the first three, updated, and the next row towards each end.
     """
     row, d2, e2, most = best
     known = row
@@ -65,7 +65,7 @@ def walk(
 
 @kernel("i8(f8[:, ::1], i8, i8, f8)", inner=True)
 def place_on_axis(rows: Array, low: int, high: int, r: float) -> int:
-    """First row of the axis [low, high) that is not nearer to the origin than ``r``, by bisection."""
+    """First row of the axis [low, high) at a distance of at least ``r`` from the origin, by bisection."""
     while low < high:
         m = (low + high) >> 1
         if rows[m, 2] < r:
@@ -77,10 +77,10 @@ def place_on_axis(rows: Array, low: int, high: int, r: float) -> int:
 
 @kernel("Tuple((i8, f8, f8))(f8[:, ::1], i8[::1], f8[:, ::1], f8, f8, f8)", inline=True)
 def glance(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: float) -> tuple[int, float, float]:
-    """The few rows in the query's sector and beside it: row, squared distance, bound (squared) for all others.
+    """Compare the few rows in the query's sector and beside it: row, squared distance, bound (squared) for all others.
 
-    The answer is final where the bound is not below the squared distance: then the rays that bound what was looked at
-    are at least as far away. Otherwise :func:`search` has to go on from it.
+    The result is final where the bound is not below the squared distance: then the outer rays are at least as far away.
+    Otherwise :func:`search` has to continue.
     """
     sectors = len(start) - 1
     home = sector_of(qx, qy, sectors)
@@ -104,7 +104,7 @@ def glance(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2: 
 def compare_through(
     rows: Array, low: int, high: int, qx: float, qy: float, best: tuple[int, float, float]
 ) -> tuple[int, float, float]:
-    """All rows [low, high) of an axis, four at a time, equal ones once; ``best`` as in :func:`walk`."""
+    """Compare all rows [low, high) of an axis, four at a time, equal ones once; ``best`` as in :func:`walk`."""
     row, d2, e2 = best
     known = row
     if high > low and rows[low, 0] == rows[high - 1, 0] and rows[low, 1] == rows[high - 1, 1]:
@@ -133,7 +133,7 @@ def compare_through(
 def search_axis(
     rows: Array, low: int, high: int, qx: float, qy: float, best: tuple[int, float, float]
 ) -> tuple[int, float, float, int]:
-    """:func:`walk` along the axis [low, high) of one sector; what lies at like distances is compared through."""
+    """:func:`walk` along the axis [low, high) of one sector; rows at similar distances are compared in full."""
     row, d2, e2 = best
     rq = np.sqrt(qx * qx + qy * qy)
     at = place_on_axis(rows, low, high, rq)
@@ -155,7 +155,7 @@ def search_axis(
 def search_group(
     rows: Array, start: Ints, group: int, qx: float, qy: float, best: tuple[int, float, float]
 ) -> tuple[int, float, float, int]:
-    """The rows of a group of sectors, each its axis where they are many; ``best`` as in :func:`walk`."""
+    """Search the rows of a group of sectors, along each axis where they are many; ``best`` as in :func:`walk`."""
     row, d2, e2 = best
     first = GROUP * group
     last = min(first + GROUP, len(start) - 1)
@@ -184,14 +184,14 @@ def search(
     """Row nearest to the query (relative to the centre), given one at squared distance ``d2`` (row -1: only a bound).
 
     Returns row, squared distance, bound for all others (squared) and the number of rows visited. From the query's own
-    group the search goes round to both sides, until a ray is farther away than the best pair. No ray is farther away
-    than the centre: where that is nearer than the best pair, bearings mean nothing and the rings alone decide.
+    group the search goes to both sides, until a ray is farther than the best pair. No ray is farther away than the
+    centre. Where the centre is nearer than the best pair, bearings give no bound and only the rings do.
     """
     r2 = qx * qx + qy * qy
     sectors = len(start) - 1
     groups = (sectors + GROUP - 1) // GROUP
     home = sector_of(qx, qy, sectors) // GROUP
-    if sectors == 1:  # the paper's form, walked to where it ends
+    if sectors == 1:  # the paper's form, one complete walk
         at = place_on_axis(rows, 0, len(rows), np.sqrt(r2))
         row, d2, e2, down, up = walk(rows, 0, len(rows), at, qx, qy, (row, d2, np.inf, len(rows) + 1))
         return row, d2, e2, up - down - 1
@@ -251,9 +251,9 @@ def nearest(rows: Array, start: Ints, rays: Array, qx: float, qy: float, bound2:
 def nearest_all(
     rows: Array, start: Ints, rays: Array, queries: Array, bound2: float, out: tuple[Ints, Array, Array, Ints]
 ) -> None:
-    """:func:`nearest` for queries of shape (m, 2) relative to the centre, and how many rows were visited for each.
+    """:func:`nearest` for queries (m, 2) relative to the centre, with the number of rows visited for each.
 
-    Neighbours in the sequence are neighbours in the room: the partner of the one before is a first guess.
+    Consecutive queries are close to each other, so the previous partner is the initial candidate.
     """
     row, d2, e2, visits = out
     last = -1
@@ -273,7 +273,7 @@ def nearest_all(
 
 
 def query_axis(axis: Axis, queries: Array, bound: float = np.inf) -> tuple[Ints, Array, Ints]:
-    """Label of the nearest reference point, its distance and the points visited for each query (m, 2).
+    """Label of the nearest reference point, its distance (m) and the number of points visited for each query (m, 2).
 
     Label -1 and distance ``bound`` where none is nearer than that.
     """
@@ -285,7 +285,7 @@ def query_axis(axis: Axis, queries: Array, bound: float = np.inf) -> tuple[Ints,
 
 
 def nearest_slow(points: Array, queries: Array, bound: float = np.inf) -> tuple[Ints, Array]:
-    """The slow twin of :func:`query_axis`: every pair is compared."""
+    """Brute-force reference implementation of :func:`query_axis`: every pair is compared."""
     found = np.full(len(queries), -1, np.int64)
     distance = np.full(len(queries), bound)
     for i, q in enumerate(queries):

@@ -1,10 +1,10 @@
-"""How many neighbouring beams err alike, and so tell no more than one.
+"""Effective sample size of a scan: beams per independent measurement, from the AR(1) correlation of residuals.
 
-The statistics of a match count every beam as a witness of its own. Real ranges are not like that: colour, incidence and
-unevenness of a surface shift neighbouring beams together. What matches leave over shows it: the residuals of a scan, in
-the order of its beams, are a first-order autoregression to good approximation, and a mean over it carries
-``(1 - rho) / (1 + rho)`` of the information that independent beams would (URG-04LX a fifth, UTM-30LX an eighth,
-SICK LMS a third). Simulated noise is independent, and there nothing is taken away.
+The statistics of a match count every beam as independent. Real ranges are not: colour, incidence and unevenness of a
+surface shift neighbouring beams together. The residuals of a scan, in beam order, are to good approximation a
+first-order autoregression with coefficient ``rho``. Their mean carries ``(1 - rho) / (1 + rho)`` of the information of
+independent beams (URG-04LX a fifth, UTM-30LX an eighth, SICK LMS a third). Simulated noise is independent and loses
+nothing.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from estimator.scan_matching.distance_axis import Axis
 from estimator.scan_matching.nearest_neighbour import nearest
 
 BESIDE_M = 0.2
-"""Farther apart, two points in a row lie on different surfaces."""
+"""Largest distance (m) of two consecutive points on one surface."""
 
 MOST = 0.9
-"""Largest correlation that is believed: ten neighbours are one witness, and more of them is a map that does not fit."""
+"""Largest correlation in use, 19 beams per measurement; a larger one means that the map does not fit."""
 
 
 @kernel("void(f8[:, ::1], Tuple((f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])), f8[::1], f8, f8[::1])")
 def neighbours_agree(
     points: Array, reference: tuple[Array, Ints, Array, Array], T: Array, gate: float, sums: Array
 ) -> None:
-    """Sums over points and their next: product of the two residuals, mean of their squares, pairs.
+    """Write sums over neighbouring points: product of the two residuals, mean of their squares, number of pairs.
 
     ``points``: (n, 4) in the base frame. ``reference``: rows, start, rays of the axis, and lines. ``T``: matched pose
-    relative to the axis centre. ``gate``: farthest partner, m. ``sums``: 3.
+    relative to the axis centre. ``gate``: largest distance of a partner, m. ``sums``: (3,).
     """
     rows, start, rays, lines = reference
     c, s = np.cos(T[2]), np.sin(T[2])
@@ -53,7 +53,7 @@ def neighbours_agree(
 
 
 def agreement(points: Array, axis: Axis, lines: Array, T: Array, gate: float) -> Array:
-    """:func:`neighbours_agree` for a pose in the odom frame."""
+    """:func:`neighbours_agree` for a pose in the odom frame; returns the sums (3,)."""
     sums = np.zeros(3)
     relative = T - np.array((axis.centre[0], axis.centre[1], 0.0))
     neighbours_agree(points, (axis.rows, axis.start, axis.rays, lines), relative, gate, sums)
@@ -61,6 +61,6 @@ def agreement(points: Array, axis: Axis, lines: Array, T: Array, gate: float) ->
 
 
 def beams_each(product: float, square: float) -> float:
-    """How many beams tell as much as one independent beam: 1 where neighbours do not agree, or nothing is known."""
+    """Beams per independent measurement, 1 without correlation or without data."""
     rho = min(max(product / square, 0.0), MOST) if square > 0.0 else 0.0
     return (1.0 + rho) / (1.0 - rho)

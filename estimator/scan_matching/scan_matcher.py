@@ -1,4 +1,4 @@
-"""Matching one scan against the local map: the call, a second opinion where the first is in doubt, and the verdict."""
+"""Scan-to-map matching: ICP attempt from the prediction, multi-start where it is doubtful, and acceptance test."""
 
 from __future__ import annotations
 
@@ -18,27 +18,29 @@ from estimator.scan_matching import icp
 from estimator.scan_matching.local_map import LocalMap, contradicted
 
 FIRST, TRIAL, FINISH, LEAST = 20, 10, 12, 8
-"""Most iterations of a first attempt and of a trial of the second opinion; iterations kept for the attempt that
-finishes it; fewer than the last are too few to begin one."""
+"""Most iterations of the first attempt and of a trial start; iterations reserved for the last attempt; fewest of it."""
 
 SURE = 0.8
-"""Share of fitting beams beyond which no evidence against a place is looked for, unless it is far away."""
+"""Inlier share above which the free-space violation is not tested, unless the pose is far from the prediction."""
 
 FEW = 3.0
-"""Points that a direction must be seen with before it can speak against a place."""
+"""Prior number of fitting points in each direction, so that a few points there cannot reject a pose."""
 
 CLAIM = 1.15
-"""What an information matrix is worth in truth: a Cauchy weight counts a Gaussian residual 0.89 times, but costs only
-0.04 of what it knows; and surfaces met at a grazing angle are trusted less than an ideal beam would deserve."""
+"""True information over computed information.
+
+A Cauchy weight scales a Gaussian residual by 0.89, but costs only 0.04 of its information. Surfaces at a grazing angle
+are weighted less than an ideal beam would justify.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """What a place must show to be believed.
+    """Acceptance thresholds of a matched pose.
 
     Attributes:
-        ways: each the least share of the beams that must fit and the largest share of the evidence that may speak
-            against it, in falling order. held: the least, see :func:`held`.
+        ways: alternatives in falling order, each the smallest inlier share and the largest free-space violation.
+        held: the smallest value of :func:`held`.
     """
 
     ways: tuple[tuple[float, float], ...]
@@ -47,19 +49,24 @@ class Demand:
 
 @dataclass(frozen=True, slots=True)
 class MatchSettings:
-    """Matching, in terms of the physics.
+    """Settings of the scan matcher, in physical terms.
 
     Attributes:
-        gate_m: farthest partner ever accepted. scale: final robust scale in units of the noise.
-        settled: a step shorter than this share of its own standard deviation ends the iteration.
-        min_points: fewest pairs that make a result.
-        tracking, near, far: what is asked when the prediction was good; when it was vague, of a place within ``near_m``
-            and ``near_rad`` of it; and of one farther away, or where it was wrong (a wrong place can look half right).
-        wide_m, wide_rad: deviations of the prediction beyond which it counts as not good.
-        doubt_share, doubt_against: where fewer beams fit and more speaks against the place, another is looked for.
-        doubt_m, doubt_rad: deviations of the prediction are then taken to be at least these. ``fan`` headings to either
-            side are tried, ``fan_rad`` apart, then places ``shift_m`` away, on at most ``few`` points.
-        coarse, dense: every how many points will do while the pose is far off, in scans of how many.
+        gate_m: largest distance of a partner.
+        scale: final robust scale in units of the noise.
+        settled: a step shorter than this share of its own sigma ends the iteration.
+        min_points: fewest pairs that give a result.
+        tracking: thresholds after a good prediction.
+        near: thresholds after an uncertain one, for a pose within ``near_m`` and ``near_rad`` of it.
+        far: thresholds for a pose farther away, or where the prediction was wrong; a wrong pose can fit half of the
+            scan.
+        wide_m, wide_rad: sigma of the prediction above which it counts as uncertain.
+        doubt_share, doubt_against: multi-start where fewer beams fit and the free-space violation is larger.
+        doubt_m, doubt_rad: smallest sigma of the prediction in a multi-start.
+        fan, fan_rad: number of headings tried on either side, and their spacing.
+        shift_m: distance of the positions tried then.
+        few: most points of a trial.
+        coarse, dense: point stride while the pose is far off, in scans of more than ``dense`` points.
     """
 
     gate_m: float = 0.5
@@ -87,12 +94,14 @@ class MatchSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What is to be matched.
+    """The input of a match.
 
     Attributes:
-        points: (n, 4) place and tangent in the base frame at the scan's end. T_base_lidar: mount. beams: the scan they
-        came from, for what it says of free space. noise_m: range noise to reckon with. alike: how many beams tell as
-        much as one of them would, were their errors independent (`estimator.scan_matching.residual_correlation`).
+        points: (n, 4) position and tangent in the base frame at the scan's end.
+        T_base_lidar: mount.
+        beams: of the scan, for the free-space test.
+        noise_m: assumed range noise.
+        alike: beams per independent measurement (`estimator.scan_matching.residual_correlation`).
     """
 
     points: Array
@@ -111,11 +120,11 @@ class Prior:
 
 
 Asked = tuple[View, LocalMap, Prior, int, MatchSettings]
-"""What :func:`match` is asked with; whoever keeps it can have the match told again, iteration by iteration."""
+"""The arguments of :func:`match`; with them a match can be repeated, iteration by iteration."""
 
 
 class ScanMatcher(Protocol):
-    """Matches one scan with the local map, or with its newest keyframe; :func:`match` is the default."""
+    """Interface of a scan matcher, against the local map or its newest keyframe; :func:`match` is the default."""
 
     def __call__(self, view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings, /) -> MatchResult:
         """Match a scan from its prediction in at most ``cap`` iterations."""
@@ -123,13 +132,17 @@ class ScanMatcher(Protocol):
 
 @dataclass(slots=True, eq=False)
 class Attempt:
-    """Outcome of one run of iterations from one start.
+    """Result of one ICP run from one start.
 
     Attributes:
-        T: pose. H: information of the laser. sums: of the last pass. points: queries.
-        trace: (iterations, icp.TRACE), what each iteration saw and did; poses relative to the axis centre.
-        view, prior: what was matched, and from where. contradicted: see :meth:`against`, None before that is asked.
-        demand: what was asked of it, None before a verdict.
+        T: pose.
+        H: information of the lidar (3, 3).
+        sums: of the last pass.
+        points: number of queries.
+        trace: (iterations, icp.TRACE), a row an iteration; poses relative to the axis centre.
+        view, prior: input and start.
+        contradicted: free-space violation, see :meth:`against`; None until it is computed.
+        demand: thresholds, None before the acceptance test.
     """
 
     T: Array
@@ -145,31 +158,31 @@ class Attempt:
 
     @property
     def share(self) -> float:
-        """Share of the beams that fit."""
+        """Inliers as a share of the queries."""
         return float(self.sums[icp.INLIERS]) / max(self.points, 1)
 
     def against(self, local: LocalMap) -> float:
-        """Share of the evidence that speaks against the place; looked up once."""
+        """Free-space violation (0 to 1) at the pose; computed once."""
         if self.contradicted is None:
             at = se2.compose(self.T, self.view.T_base_lidar)
             self.contradicted = contradicted(local, at, self.view.beams, self.view.noise_m)
         return self.contradicted
 
     def score(self, local: LocalMap) -> float:
-        """How well a place fits, to be compared with others for the same scan."""
+        """Score of the pose, comparable between poses of the same scan."""
         return self.share - 2.0 * self.against(local)
 
     def fits(self, local: LocalMap, settings: MatchSettings) -> bool:
-        """Whether a place fits so well that no other need be looked for."""
+        """Whether the pose fits so well that no other start is needed."""
         return self.share > SURE and self.against(local) <= settings.doubt_against
 
 
 def match(
     view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings, tried: list[Attempt] | None = None
 ) -> MatchResult:
-    """Match a scan from its prediction in at most ``cap`` iterations, a second opinion included.
+    """Match a scan from its prediction in at most ``cap`` iterations; a doubtful first attempt leads to a multi-start.
 
-    Every attempt is added to ``tried``, if one asks: the first, the trials of the second opinion, its last.
+    Every attempt is appended to ``tried`` if it is given: the first, the trials of the multi-start, the last.
     """
     tried = [] if tried is None else tried
     first = attempt(view, local, prior, min(cap, FIRST), settings)
@@ -184,12 +197,12 @@ def match(
 
 
 def reference_of(local: LocalMap) -> icp.Reference:
-    """The map as the kernels take it."""
+    """The local map as the arrays of the kernels."""
     return local.axis.rows, local.axis.start, local.axis.rays, local.lines
 
 
 def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: MatchSettings) -> Attempt:
-    """Iterate from a prediction."""
+    """Run the ICP iterations from a prediction."""
     H, sums, trace = np.zeros((3, 3)), np.zeros(icp.SUMS), np.empty((cap, icp.TRACE))
     axis, noise = local.axis, view.noise_m
     coarse = settings.coarse if len(view.points) > settings.dense else 1
@@ -202,7 +215,7 @@ def attempt(view: View, local: LocalMap, prior: Prior, cap: int, settings: Match
 
 
 def in_doubt(first: Attempt, result: MatchResult, local: LocalMap, settings: MatchSettings) -> bool:
-    """Whether another place might fit better: it is no result, or much does not fit and some speaks against it."""
+    """Whether another pose may fit better: no result, or too few inliers together with a free-space violation."""
     if not result.ok:
         return True
     least = settings.doubt_share if first.demand is settings.tracking else SURE
@@ -212,10 +225,10 @@ def in_doubt(first: Attempt, result: MatchResult, local: LocalMap, settings: Mat
 def second_opinion(
     local: LocalMap, prior: Prior, settings: MatchSettings, tried: list[Attempt], budget: int
 ) -> tuple[Attempt, int]:
-    """Doubt the prediction: look about it for the place and heading that fit best, on a few points; finish that one.
+    """Multi-start: try poses around the prediction on a few points, then finish the best with all points.
 
-    ``tried`` ends with the first attempt, and gets the others. ``budget``: points that may be passed over in all
-    iterations, of which a share is kept for the last. Returns the better of first and last, and the points passed over.
+    ``tried`` ends with the first attempt; the others are appended. ``budget``: points that all iterations may process,
+    a share of which is reserved for the last attempt. Returns the better of first and last, and the points processed.
     """
     first = tried[-1]
     view = first.view
@@ -241,13 +254,13 @@ def second_opinion(
 
 
 def doubted(prior: Prior, settings: MatchSettings) -> Array:
-    """Information of a prediction that has turned out to be worse than it said."""
+    """Information (3, 3) of the prediction, reduced for a multi-start."""
     most = settings.doubt_m**-2, settings.doubt_m**-2, settings.doubt_rad**-2
     return np.diag(np.minimum(np.diag(prior.L), most))
 
 
 def starts(prior: Prior, tried: list[Attempt], settings: MatchSettings) -> Iterator[Prior]:
-    """Where to look again: headings to either side of the prediction; then places around it, with the best heading."""
+    """Starts of the multi-start: headings around the prediction, then positions around it with the best heading."""
     L = doubted(prior, settings)
     for k in sorted(range(-settings.fan, settings.fan + 1), key=abs):
         yield Prior(prior.T + np.array((0.0, 0.0, k * settings.fan_rad)), L)
@@ -257,7 +270,7 @@ def starts(prior: Prior, tried: list[Attempt], settings: MatchSettings) -> Itera
 
 
 def verdict(best: Attempt, local: LocalMap, prior: Prior, settings: MatchSettings) -> MatchResult:
-    """Judge an attempt: whether it is a result, and why not."""
+    """Acceptance test of an attempt; returns the match result with its reason."""
     sums, (x, y, yaw), (x1, y1, yaw1) = best.sums.tolist(), best.T.tolist(), prior.T.tolist()
     length2 = sums[icp.LENGTH2]
     T = np.array((x, y, se2.wrap(yaw)))
@@ -287,7 +300,7 @@ def verdict(best: Attempt, local: LocalMap, prior: Prior, settings: MatchSetting
 
 
 def demand_on(prior: Prior, correction: Array, settings: MatchSettings) -> Demand:
-    """What is asked of a place: more if the prediction was vague or wrong, and most if it is far from it, too."""
+    """Thresholds for a pose: higher if the prediction was uncertain or wrong, highest far away from it."""
     Lx, Ly, Lyaw = prior.L.diagonal().tolist()
     wide = 1.0 / Lx + 1.0 / Ly > settings.wide_m**2 or 1.0 / Lyaw > settings.wide_rad**2
     x, y, yaw = correction.tolist()
@@ -301,7 +314,7 @@ def demand_on(prior: Prior, correction: Array, settings: MatchSettings) -> Deman
 
 
 def plausible(best: Attempt, demand: Demand, local: LocalMap, settings: MatchSettings) -> bool:
-    """Whether enough of the scan fits the map there, and not too much of either speaks against the place."""
+    """Whether enough of the scan fits the map, with a small enough free-space violation."""
     if best.share < demand.ways[-1][0]:
         return False
     if best.share <= SURE or demand is settings.far:
@@ -312,10 +325,10 @@ def plausible(best: Attempt, demand: Demand, local: LocalMap, settings: MatchSet
 
 
 def held(best: Attempt, local: LocalMap, settings: MatchSettings) -> float:
-    """Share of the surfaces seen that fit the map, in the direction where it is smallest of those that count as known.
+    """Share of the visible surfaces that fit the map, in the known direction where it is smallest.
 
-    A scan that is shifted along a wall fits it as well as ever, with most of its points; what shows the error are the
-    few that lie across. Directions in which hardly anything is seen count as fitting.
+    After a shift along a wall, most of a scan's points still fit that wall. Only the few points on surfaces across it
+    reveal the error. Directions with hardly any visible surface count as fitting.
     """
     known = known_axes(best.H)
     if known[0] == known[1] == 0.0:
@@ -328,17 +341,20 @@ def held(best: Attempt, local: LocalMap, settings: MatchSettings) -> float:
         return float(fyy / syy)
     if known[1] == 0.0:
         return float(fxx / sxx)
-    # the lesser root of det(fitting - share * seen) = 0
+    # the smaller root of det(fitting - share * seen) = 0
     a, b, c = sxx * syy - sxy * sxy, fxx * syy + fyy * sxx - 2.0 * fxy * sxy, fxx * fyy - fxy * fxy
     return float((b - math.sqrt(max(0.0, b * b - 4.0 * a * c))) / (2.0 * a))
 
 
 def known_axes(H: Array) -> Array:
-    """1 for each of x, y, yaw that the information brings from 0.5 m and 10 deg to 10 cm and 2 deg, else 0."""
+    """1 for each of x, y, yaw that the information makes known, else 0.
+
+    Known: it reduces sigma from 0.5 m and 10 deg to 10 cm and 2 deg.
+    """
     x, y, yaw = invert3(H + VAGUE).diagonal().tolist()
     return np.array((float(x < 0.01), float(y < 0.01), float(yaw < 0.0012)))
 
 
 def no_match(T_pred: Array, queries: int, reason: Reason) -> MatchResult:
-    """A match that did not take place, and why."""
+    """Result without a match, with its reason."""
     return MatchResult(T_pred.copy(), np.zeros((3, 3)), 0, queries, 0, 0.0, np.zeros(3), np.zeros(3), reason)

@@ -1,8 +1,8 @@
-"""Scans that no lidar can have measured are refused before anything is computed from them, and it is said why.
+"""Scan validation: rejects scans that no lidar can have measured, with a reason, before any computation.
 
-A bearing or a mount that is no number would become an index in the kernels; an angle of millions of turns has no digits
-left for the beams, which then fall together to a scan that fits anywhere; arrays that do not belong together, or a
-sweep that ends before it begins, come from a program and not from the world.
+A non-finite bearing or mount would become an array index in the kernels. At an angle of millions of turns rounding
+merges the beams into a scan that fits anywhere. Arrays of different lengths, or a scan that ends before it begins, are
+program errors.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ LONGEST_SWEEP_S = 10.0
 FARTHEST_MOUNT_M = 100.0
 LARGEST_NOISE_M = 1.0
 LATEST_S = 1e11
-"""No clock of a robot, and no stamp of a log, is three thousand years from its zero."""
+"""Largest plausible instant, s: about three thousand years from the zero of a clock."""
 FULL_TURN = 2.0 * math.pi + 0.1
-"""Bearings of one sweep span no more than this; nor is one of them, or a mount's yaw, farther from zero."""
+"""Largest span of the bearings of one scan, and largest magnitude of a bearing or of a mount's yaw, rad."""
 
 
 def refused(matching: MatchMemory, scan: Scan) -> Reason | None:
-    """Why a scan may not be looked at, None if it may; what has been found good of it is remembered."""
+    """Reason to reject a scan, None if it is valid; updates the newest scan end and the validated bearings."""
     if not (well_formed(scan) and even(matching, scan.bearing_rad)):
         return Reason.MALFORMED
     late = scan.t_end < matching.t_newest_scan
@@ -36,7 +36,7 @@ def refused(matching: MatchMemory, scan: Scan) -> Reason | None:
 
 
 def well_formed(scan: Scan) -> bool:
-    """Whether arrays, times, mount and noise of a scan can be those of a sweep."""
+    """Whether arrays, times, mount and noise of a scan are plausible."""
     shape = scan.bearing_rad.shape
     for values, dtype in ((scan.bearing_rad, np.float64), (scan.range_m, np.float64), (scan.beam, np.uint8)):
         if values.shape != shape or values.dtype != dtype or not values.flags.c_contiguous:
@@ -51,7 +51,7 @@ def well_formed(scan: Scan) -> bool:
 
 
 def even(matching: MatchMemory, bearing: Array) -> bool:
-    """Whether bearings run one way, within a turn; looked at once for all scans that share the array."""
+    """Whether bearings are monotonic and within a turn; an array that several scans share is checked once."""
     if bearing is matching.bearing_rad or len(bearing) < 2:
         return True
     steps = np.diff(bearing) if np.isfinite(bearing).all() else np.zeros(1)
@@ -64,10 +64,10 @@ def even(matching: MatchMemory, bearing: Array) -> bool:
 
 
 def nothing_of(scan: Scan) -> ScanPoints:
-    """What is seen of a scan that may not be looked at."""
+    """Empty points of a rejected scan."""
     return ScanPoints(np.empty((0, 2)), np.zeros(2), 0.0, scan.sigma_m)
 
 
 def in_time(t_mono: float) -> bool:
-    """Whether an instant can be one; a pose that was carried to another would be out of time for good."""
+    """Whether an instant is plausible; a pose predicted to an implausible one could never return."""
     return abs(t_mono) < LATEST_S
