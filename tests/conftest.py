@@ -29,7 +29,7 @@ FIRST = (
     "tools/test_soak.py",
     "faults/test_matrix.py",
     "systemd/test_container.py",
-    "tools/experiments/test_integrity.py",
+    "tools/experiments/integrity/test_campaign.py",
     "logs/test_figures.py",
 )
 """Files that take minutes, longest first: where files are shared out to the cores none of them is begun last."""
