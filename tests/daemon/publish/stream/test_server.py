@@ -22,7 +22,6 @@ from daemon.publish.stream import server as stream_server
 from daemon.publish.stream import session as stream_session
 from daemon.publish.stream.server import Client, StreamServer, scan_message
 from daemon.snapshot import Snapshot, State
-from hal.clock import run_virtual
 from hal.errors import DeviceRefused
 from hal.lidar import VALID, LidarGeometry, RawScan
 from tests.daemon.publish.network import Wire
@@ -233,28 +232,25 @@ def test_an_unknown_topic_is_named(tmp_path: Path) -> None:
     run(tmp_path / "stream", body)
 
 
-def test_many_requests_at_once_are_taken_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.virtual
+async def test_many_requests_at_once_are_taken_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each may have the whole map sent anew: the loop goes on in between, and no more of them are read meanwhile."""
     asked: list[frozenset[str]] = []
-
-    async def body() -> None:
-        server = serve(Path("unused"))
-        monkeypatch.setattr(server, "welcome", lambda client, fresh: asked.append(fresh))
-        client = Client(server)
-        wire = Wire(client)
-        client.connection_made(wire)
-        for turn in (1, 2):
-            client.data_received((stream_server.framed({"want": []}) + stream_server.framed({"want": ["map"]})) * 50)
-            assert (len(asked), wire.reading) == (100 * (turn - 1) + stream_session.REQUESTS_PER_TURN, False)
-            await asyncio.sleep(2.0)
-            assert (len(asked), wire.reading) == (100 * turn, True)
-        assert asked == [frozenset(), frozenset({"map"})] * 100
-        client.data_received(stream_server.framed({"want": []}) * 50)
-        wire.close()
+    server = serve(Path("unused"))
+    monkeypatch.setattr(server, "welcome", lambda client, fresh: asked.append(fresh))
+    client = Client(server)
+    wire = Wire(client)
+    client.connection_made(wire)
+    for turn in (1, 2):
+        client.data_received((stream_server.framed({"want": []}) + stream_server.framed({"want": ["map"]})) * 50)
+        assert (len(asked), wire.reading) == (100 * (turn - 1) + stream_session.REQUESTS_PER_TURN, False)
         await asyncio.sleep(2.0)
-        assert len(asked) == 200 + stream_session.REQUESTS_PER_TURN, "who has gone asks no more"
-
-    run_virtual(body())
+        assert (len(asked), wire.reading) == (100 * turn, True)
+    assert asked == [frozenset(), frozenset({"map"})] * 100
+    client.data_received(stream_server.framed({"want": []}) * 50)
+    wire.close()
+    await asyncio.sleep(2.0)
+    assert len(asked) == 200 + stream_session.REQUESTS_PER_TURN, "who has gone asks no more"
 
 
 def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
