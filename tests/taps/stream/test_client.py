@@ -33,7 +33,7 @@ from daemon.snapshot import (
     Trust,
 )
 from hal.adc import Blemish, RawSamples
-from tests.daemon.publish.stream.test_server import raw_scan, run
+from tests.daemon.publish.stream.test_server import raw_scan, running
 from tests.taps.serving import served
 
 LINK = LightLink(5, 12, LinkUse.ACCEPTED, 1e-6, 0.01)
@@ -63,8 +63,8 @@ async def first(told: Stream, kind: type[Frame | Lost]) -> Frame | Lost:
     raise AssertionError("it ended")
 
 
-def test_every_topic_arrives_with_its_type(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_every_topic_arrives_with_its_type(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         seen: dict[type, Frame] = {}
         async with aclosing(Stream(server.path, tuple(set(TOPICS) - {"map"})).frames()) as heard:
             async for frame in heard:
@@ -88,8 +88,6 @@ def test_every_topic_arrives_with_its_type(tmp_path: Path) -> None:
         assert lights.links == (messages.Link(code=5, lamp_id=12, use=1, strength=1e-6, residual=0.01),)
         assert isinstance(scan, messages.Scan)
         np.testing.assert_array_equal(scan.ranges_m(), np.array([1.0, np.nan, 2.5], np.float32))
-
-    run(tmp_path / "stream", body)
 
 
 def tell_all(server: StreamServer) -> None:
