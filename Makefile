@@ -51,7 +51,7 @@ quick: venv  ## the tests of what has changed since main, most specific first (<
 test: venv  ## everything quick (no root, <= 12 minutes)
 	@$(BIN)/python -c "from daemon.runtime.warmup import load; load()" & warm=$$!; trap "kill $$warm" INT TERM; \
 	$(MAKE) --no-print-directory check; checked=$$?; wait $$warm && exit $$checked  # each keeps one processor busy
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -p tools.ci.durations -m "$(QUICK)" $(ARGS)
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "$(QUICK)" $(ARGS)
 
 # Compiled kernels are invisible to coverage, so the estimator is also run without the compiler, beside the compiling;
 # that row is silent unless it fails. Of the rest only what is traced (tests/conftest.py) is run once more.

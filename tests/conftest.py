@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
 import gc
+import inspect
 import os
 import subprocess
 import sys
@@ -14,6 +16,8 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+
+from hal.clock import run_virtual
 
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")  # how long an example takes there says nothing; `tests.fuzz` judges stalls
@@ -29,7 +33,7 @@ FIRST = (
     "tools/test_soak.py",
     "faults/test_matrix.py",
     "systemd/test_container.py",
-    "tools/experiments/test_integrity.py",
+    "tools/experiments/integrity/test_campaign.py",
     "logs/test_figures.py",
 )
 """Files that take minutes, longest first: where files are shared out to the cores none of them is begun last."""
@@ -73,6 +77,17 @@ def _turn(item: pytest.Item) -> int:
     """Place of its file in :data:`FIRST`; all others behind them, in the order in which they were."""
     name = item.path.relative_to(ROOT / "tests").as_posix()
     return FIRST.index(name) if name in FIRST else len(FIRST)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a coroutine test in an event loop of its own, with the mark ``virtual`` in virtual time."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    given = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
+    run = run_virtual if pyfuncitem.get_closest_marker("virtual") else asyncio.run
+    run(pyfuncitem.obj(**given))
+    return True
 
 
 @pytest.fixture(scope="session")

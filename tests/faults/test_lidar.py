@@ -83,6 +83,9 @@ BYTES += [
     Case("all damaged", "what = 'bit_flip'", ("invalid", "resyncs", "~frame was dropped"), RESTART),
     Case("all garbage", "what = 'garbage'; on = 'all'", ("resyncs", "~unreadable"), REOPEN),
     Case("damaged texts", "what = 'bit_flip'; on = 'replies'; share = 0.5", (), REOPEN, start=True),
+    Case("status flipped", "what = 'bit_flip'; part = 'status'", ("resyncs",), REOPEN),
+    Case("alien_reply VV", "what = 'alien_reply'; command = 'VV'; every = 3", ("invalid",), gap=0.09),
+    Case("all garbage of a network", "what = 'garbage'; on = 'all'", ("resyncs",), REOPEN, model=UST_10LX),
     Case("all kinds", " + ".join(f"what = '{w}'; share = 0.1" for w in KINDS), ("invalid", "missed"), RESTART),
 ]  # fmt: skip
 
@@ -93,6 +96,10 @@ STAMPS = [
     Case("stamp_jump ahead once", "what = 'stamp_jump'; by_ms = 40000; count = 1", ("invalid",), gap=0.06),
     Case("stamp_jump back", "what = 'stamp_jump'; by_ms = -5000", ("clock_resets",), gap=0.06),
     Case("stamp_jump ahead", "what = 'stamp_jump'; by_ms = 40000", ("clock_resets",), gap=0.06),
+    Case("stamp_jump of a wrap", "what = 'stamp_jump'; by_ms = 8388608", ("clock_resets",), gap=0.06),
+    Case("stamp_jump a little back", "what = 'stamp_jump'; by_ms = -200", ("clock_resets",), gap=0.06),
+    Case("stamp_jump a little ahead once", "what = 'stamp_jump'; by_ms = 300; count = 1", ("invalid",), gap=0.06),
+    Case("set_clock to zero", "what = 'set_clock'; ms = 0", ("clock_resets",), gap=0.06),
     Case("set_clock", "what = 'set_clock'; ms = 100", ("clock_resets",), gap=0.06, unit=Unit(clock_ms=5_000_000)),
     Case("wrap", "what = 'dark'; count = 1", (), gap=0.03, unit=Unit(clock_ms=(1 << 24) - 5000)),
     Case("wrap and set_clock", "what = 'set_clock'", ("clock_resets",), gap=0.06),
@@ -102,6 +109,7 @@ STAMPS = [
 LINE = [
     Case("silence", "what = 'silence'", ("resyncs", "~fallen silent"), REOPEN),
     Case("short silence", "what = 'silence'", ("missed",), seconds=0.5),
+    Case("silence of a network", "what = 'silence'", ("resyncs",), REOPEN, model=UST_10LX),
     Case("stall and burst", "what = 'stall'", (), seconds=0.9, gap=0.95),
     Case("long stall and burst", "what = 'stall'", ("resyncs", "~fallen silent"), REOPEN),
     Case("hangup", "what = 'hangup'", ("reconnects", "~."), REOPEN),
@@ -115,6 +123,10 @@ LINE = [
     Case(
         "modem manager", "what = 'inject'; when = 0.5 + what = 'inject'; text = 'ATE1 E0\\r'; when = 1.0", (), gap=0.03
     ),
+    Case("inject QT", "what = 'inject'; text = \"QT\\n\"", ("resyncs",), RESTART),
+    Case("inject TM0", "what = 'inject'; text = \"TM0\\n\"", (), RESTART),
+    Case("inject MD", "what = 'inject'; text = \"MD0000010001000\\n\"", ("~echo of another command",), RESTART),
+    Case("inject RS", "what = 'inject'; text = \"RS\\n\"", ("resyncs",), RESTART),
     Case("baud", "what = 'baud'; rate = 57600", ("resyncs", "~."), 8.0, model=URG_04LX),
     Case("baud from the start", "what = 'baud'; rate = 57600", (), 8.0, start=True, model=URG_04LX),
 ]
@@ -151,6 +163,8 @@ STATES = [
 WORDS = [
     Case("off", "what = 'off'", ("reconnects", "~."), REOPEN, unit=Unit(clock_ms=7_000_000)),
     Case("off of a serial line", "what = 'off'", ("resyncs", "~."), 12.0, model=replace(URG_04LX, rpm=600)),
+    Case("off of a network", "what = 'off'", ("reconnects", "~."), REOPEN, model=UST_10LX),
+    Case("slow by half", "what = 'slow'; factor = 1.5", (), RESTART),
     Case("stuck", "what = 'stuck'", ("invalid", "~its clock stands"), REOPEN),
     Case("slow", "what = 'slow'", (), 0.15, gap=0.06),
     Case("delayed", "what = 'delayed'", (), 0.4, gap=0.35),

@@ -31,38 +31,35 @@ async def until(true: Callable[[], object], seconds: float) -> None:
 
 
 @pytest.mark.realtime
-def test_driver_on_a_pty_survives_a_pulled_plug_and_a_damaged_line(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = World(UTM_30LX)
-        device = FakeHokuyo(UTM_30LX, world)
-        server = PtyServer(device, tmp_path / "ttyACM0")
-        schedule = FaultSchedule({"lidar": device})
-        driver = HokuyoDriver(server.path, clock=SystemClock(), opener=open_port)
-        scans: list[RawScan] = []
-        task = asyncio.create_task(driver.run(scans.append))
+async def test_driver_on_a_pty_survives_a_pulled_plug_and_a_damaged_line(tmp_path: Path) -> None:
+    world = World(UTM_30LX)
+    device = FakeHokuyo(UTM_30LX, world)
+    server = PtyServer(device, tmp_path / "ttyACM0")
+    schedule = FaultSchedule({"lidar": device})
+    driver = HokuyoDriver(server.path, clock=SystemClock(), opener=open_port)
+    scans: list[RawScan] = []
+    task = asyncio.create_task(driver.run(scans.append))
 
-        async def more(count: int, seconds: float) -> None:
-            wanted = len(scans) + count
-            await until(lambda: len(scans) >= wanted, seconds)
+    async def more(count: int, seconds: float) -> None:
+        wanted = len(scans) + count
+        await until(lambda: len(scans) >= wanted, seconds)
 
-        await more(20, 2.0)
-        schedule.load("[[fault]]\nwhat = 'bit_flip'\nevery = 2\ncount = 10")
-        await until(lambda: driver.status.invalid >= 10, 2.0)
-        await more(20, 1.0)
-        schedule.load("[[fault]]\nwhat = 'hangup'\nfor = 0.3")
-        await until(lambda: driver.status.link is Link.WAITING, 1.0)
-        await more(20, 3.0)
-        assert driver.status.reconnects == 1
-        assert (driver.status.link, driver.status.error) == (Link.STREAMING, None)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        await until(lambda: not device.laser, 1.0)
-        schedule.close()
-        server.close()
-        device.close()
-        numbers = [world.number(scan) for scan in scans]
-        assert None not in numbers
-        assert numbers == sorted(set(numbers), key=int)  # type: ignore[arg-type]  # None was ruled out
-        assert all(np.all(scan.code == VALID) for scan in scans)
-
-    asyncio.run(main())
+    await more(20, 2.0)
+    schedule.load("[[fault]]\nwhat = 'bit_flip'\nevery = 2\ncount = 10")
+    await until(lambda: driver.status.invalid >= 10, 2.0)
+    await more(20, 1.0)
+    schedule.load("[[fault]]\nwhat = 'hangup'\nfor = 0.3")
+    await until(lambda: driver.status.link is Link.WAITING, 1.0)
+    await more(20, 3.0)
+    assert driver.status.reconnects == 1
+    assert (driver.status.link, driver.status.error) == (Link.STREAMING, None)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    await until(lambda: not device.laser, 1.0)
+    schedule.close()
+    server.close()
+    device.close()
+    numbers = [world.number(scan) for scan in scans]
+    assert None not in numbers
+    assert numbers == sorted(set(numbers), key=int)  # type: ignore[arg-type]  # None was ruled out
+    assert all(np.all(scan.code == VALID) for scan in scans)

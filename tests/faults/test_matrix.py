@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import tomllib
-from pathlib import Path
 
 import pytest
 
@@ -49,11 +47,6 @@ def test_the_matrix_is_whole() -> None:
         assert {cell.time for cell in mine} == set(TIMES)
 
 
-def test_no_fault_passes_in_silence() -> None:
-    for cell in CELLS:
-        assert bool(cell.codes) == (cell.word != "ok"), cell.name
-
-
 @pytest.mark.system
 @pytest.mark.jit
 @pytest.mark.timeout(600)
@@ -80,15 +73,3 @@ def test_a_cell_that_is_not_survived_is_told(monkeypatch: pytest.MonkeyPatch) ->
         *("the laser was left on", "lidar does not stop"),
     ):
         assert any(words in one for one in told), told
-
-
-def test_the_table_says_what_is_wrong_with_it(tmp_path: Path) -> None:
-    path = tmp_path / "cells.toml"
-    text = (Path(__file__).parent / "cells.toml").read_text()
-    path.write_text(text.replace("[adc.off]", "[adc.offf]"))
-    with pytest.raises(ValueError, match=r"\[adc.off\] is missing"):
-        cells(path)
-    path.write_text(text.replace("noticed =", "notised ="))
-    with pytest.raises(ValueError, match="unknown notised"):
-        cells(path)
-    tomllib.loads(text)

@@ -17,13 +17,10 @@ from hal.net import inet
 from hal.port.opening import open_port
 
 
-def test_what_it_returns_and_raises_is_had_where_it_is_awaited() -> None:
-    async def run() -> None:
-        assert await run_in_thread(threading.current_thread, "x") is not threading.current_thread()
-        with pytest.raises(ValueError, match="invalid literal"):
-            await run_in_thread(partial(int, "x"), "x")
-
-    asyncio.run(run())
+async def test_what_it_returns_and_raises_is_had_where_it_is_awaited() -> None:
+    assert await run_in_thread(threading.current_thread, "x") is not threading.current_thread()
+    with pytest.raises(ValueError, match="invalid literal"):
+        await run_in_thread(partial(int, "x"), "x")
 
 
 def test_nobody_minds_the_end_of_what_was_given_up() -> None:

@@ -1,12 +1,7 @@
-"""Golden trajectories: what they are, what a person is told of them, how they are blessed."""
+"""Golden trajectories: their contents, the report of a difference, references of other machines."""
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,11 +10,10 @@ import pytest
 
 from daemon.replay.results import Trajectory
 from estimator.result import Loop
-from tests.logs import __main__ as command
 from tests.logs import bless, golden, made
 from tests.logs.__main__ import main
 from tests.logs.catalog import origin
-from tests.logs.entries import BY_NAME, ENTRIES, Entry
+from tests.logs.entries import ENTRIES, Entry
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.name)
@@ -67,33 +61,6 @@ def test_what_a_person_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: 
     assert "another processor, or other versions: 0.0009" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("spoil", "checked", "blessed"),
-    [
-        (lambda text: text.replace("# loops: ", "# loops: 9"), "loops", "moved by up to 0.00000"),
-        (lambda text: text + "garbage\n", "room.txt: the number of columns changed", "what was there is damaged"),
-        (lambda text: text.replace("# environment:", "#environment:"), "no line 'environment'", "damaged"),
-        (lambda text: "", "room.txt: no such file; git checkout it", "room: new"),
-    ],
-)
-def test_a_golden_file_that_somebody_has_edited_is_told_and_can_be_blessed(
-    spoil: Callable[[str], str], checked: str, blessed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = (golden.FOLDER / "room.txt").read_text()
-    assert "# loops: " in text
-    if spoilt := spoil(text):
-        (tmp_path / "room.txt").write_text(spoilt)
-    shutil.copy(golden.FOLDER / "room.live.txt", tmp_path)
-    monkeypatch.setattr(golden, "FOLDER", tmp_path)
-    entry = BY_NAME["room"]
-    verdict = command.checked(entry, None)
-    assert not verdict.same
-    assert checked in verdict.said
-    assert blessed in bless.bless(entry, None, "it had been edited")
-    assert command.checked(entry, None).same
-    assert bless.bless(entry, None, "it had been edited").splitlines() == ["room: unchanged", "room.live: unchanged"]
-
-
 def test_another_machine_keeps_a_reference_of_its_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,40 +88,6 @@ def test_another_machine_keeps_a_reference_of_its_own(
     with pytest.raises(SystemExit):
         bless.main()
     assert "--here" in capsys.readouterr().err
-
-
-def test_real_logs_that_are_left_out_are_said_and_fail_where_all_are_demanded(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("LUMILOOP_DATA", raising=False)
-    monkeypatch.setattr(command, "checked", lambda entry, root: golden.Verdict(True, "as blessed"))
-    real = [entry.name for entry in ENTRIES if entry.source]
-    said = f"{len(real)} of {len(ENTRIES)} logs not replayed ({', '.join(real)}): LUMILOOP_DATA does not name"
-    assert main([]) == 0
-    assert f"{said} the folder of real logs; --all fails without them\n" in capsys.readouterr().out
-    assert main(["--all"]) == 1
-    assert capsys.readouterr().out.endswith(f"{said} the folder of real logs\n")
-    monkeypatch.setenv("LUMILOOP_DATA", "/")
-    assert main(["--all"]) == 0
-    assert "not replayed" not in capsys.readouterr().out
-
-
-def test_a_log_that_is_not_there_or_another_one_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("LUMILOOP_DATA", str(tmp_path))
-    monkeypatch.setattr("sys.argv", ["bless", "--reason", "only a trial of it", "scip"])
-    before = (golden.FOLDER / "scip.txt").read_bytes()
-    log = tmp_path / "scip" / "example_urg_04lx.logr"
-    for said in ("No such file or directory; LUMILOOP_DATA names", "is another log than the one that was blessed"):
-        assert main(["scip"]) == 1
-        assert f"not replayed: {log}" in (told := capsys.readouterr().out)
-        assert said in told
-        assert bless.main() == 1
-        assert f"scip: left as it is, {log}" in capsys.readouterr().out
-        log.parent.mkdir(exist_ok=True)
-        log.write_bytes(b"another log")
-    assert (golden.FOLDER / "scip.txt").read_bytes() == before
 
 
 def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,43 +121,3 @@ def test_a_change_of_two_micrometres_is_seen(tmp_path: object, monkeypatch: pyte
     assert not golden.judged(blessed, Trajectory(np.arange(25.0), far), [], 10).same
     assert not golden.judged(blessed, trajectory, [Loop(1, 9, 2, 0.01)], 10).same
     assert golden.largest_difference(blessed, Trajectory(np.arange(24.0), poses[:24]), 10) == float("inf")
-
-
-def test_what_moved_says_where_that_began(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(golden, "FOLDER", tmp_path)
-    stamps, poses = np.arange(100.0, 150.0), np.zeros((50, 3))
-    trajectory = Trajectory(stamps, poses)
-    golden.save("x", trajectory, 10, golden.facts_of(trajectory, [], "a log", "a test"))
-    blessed = golden.load("x")
-
-    def said(stamps: np.ndarray, poses: np.ndarray) -> str:
-        return golden.judged(blessed, Trajectory(stamps, poses), [], 10).said
-
-    moved = poses.copy()
-    moved[20:] = (0.0, 0.0, -0.01)  # a turn alone moves the pose, too
-    moved[40:] = (0.0, 0.5, 0.0)
-    assert "moved by up to 0.500000 m, first at stamp 120.000000 by 0.010000 m" in said(stamps, moved)
-    late = stamps + np.where(np.arange(50) < 30, 0.0, 0.1)
-    assert "kept stamp 3 is the first that differs: 130.100000, 130.000000 when blessed" in said(late, poses)
-    longer = np.arange(100.0, 161.0)
-    assert "kept stamp 5 is the first that differs: 150.000000, 149.000000 when" in said(longer, np.zeros((61, 3)))
-    assert "kept stamp 5 is the first that differs: no more, 149.000000 when" in said(stamps[:41], poses[:41])
-    moved[30, 0] = np.nan
-    assert "first at stamp 120.000000" in said(stamps, moved)
-
-
-def test_what_cannot_be_done_is_said_before_anything_is_loaded() -> None:
-    code = (
-        "import sys\nfrom tests.logs.__main__ import main\n"
-        "try:\n    main(sys.argv[1:])\nexcept SystemExit as end:\n    print(end.code, 'numba' in sys.modules)"
-    )
-
-    def said(*words: str, **names: str) -> tuple[str, str]:
-        command = [sys.executable, "-c", code, *words]
-        done = subprocess.run(command, env={**os.environ, **names}, capture_output=True, text=True, check=True)
-        return done.stdout.splitlines()[-1], done.stderr
-
-    assert said("--help")[0] == "0 False"
-    last, error = said("intel", LUMILOOP_DATA="/nowhere")
-    assert last == "2 False"
-    assert "LUMILOOP_DATA=/nowhere: no such folder" in error

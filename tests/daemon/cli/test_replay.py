@@ -19,7 +19,7 @@ from daemon.runtime.budget import FixedBudget
 from daemon.runtime.cycle_parts import CycleRecord
 from daemon.runtime.worker import CycleWorker
 from daemon.system import console
-from hal.clock import LoopClock, run_virtual
+from hal.clock import LoopClock
 from hal.errors import DeviceFault
 from hal.replay.carmen import read_carmen
 from hal.replay.player import LogPlayer
@@ -117,7 +117,8 @@ def test_the_map_has_walls_where_the_room_has_them(out: Path, run: Drive) -> Non
     assert np.quantile(distance, 0.95) < 0.08
 
 
-def test_the_log_as_a_device_of_the_daemon_gives_the_same_poses(log: Path, out: Path) -> None:
+@pytest.mark.virtual
+async def test_the_log_as_a_device_of_the_daemon_gives_the_same_poses(log: Path, out: Path) -> None:
     """The player under the virtual loop, through daemon and pacemaker, against the replay's own drive of the cycle."""
     player = LogPlayer(read_carmen(log))
     poses: list[tuple[float, float, float]] = []
@@ -127,25 +128,22 @@ def test_the_log_as_a_device_of_the_daemon_gives_the_same_poses(log: Path, out: 
             assert record.snapshot.pose is not None
             poses.append(record.snapshot.pose)
 
-    async def main() -> None:
-        async def warm() -> None:
-            warmup.load()
+    async def warm() -> None:
+        warmup.load()
 
-        clock = LoopClock(asyncio.get_running_loop())
-        world = Environment(
-            clock, make_lidar=lambda config, clock, opener: player.lidar, make_worker=CycleWorker,
-            make_budget=FixedBudget, stopwatch=None, warm_up=warm, draw_map_id=lambda: 1,
-        )  # fmt: skip
-        daemon = Daemon(Config(modbus=ModbusConfig(port=0)), world)
-        daemon.cycle.parts.tap = keep
-        stop = asyncio.Event()
-        running = asyncio.create_task(daemon.run(stop))
-        await player.odometry.run(daemon.cycle.inbox.put_odometry)
-        await asyncio.sleep(1.0)
-        stop.set()
-        await running
-
-    run_virtual(main())
+    clock = LoopClock(asyncio.get_running_loop())
+    world = Environment(
+        clock, make_lidar=lambda config, clock, opener: player.lidar, make_worker=CycleWorker,
+        make_budget=FixedBudget, stopwatch=None, warm_up=warm, draw_map_id=lambda: 1,
+    )  # fmt: skip
+    daemon = Daemon(Config(modbus=ModbusConfig(port=0)), world)
+    daemon.cycle.parts.tap = keep
+    stop = asyncio.Event()
+    running = asyncio.create_task(daemon.run(stop))
+    await player.odometry.run(daemon.cycle.inbox.put_odometry)
+    await asyncio.sleep(1.0)
+    stop.set()
+    await running
     _, replayed = read_tum(out / "online.tum")
     assert np.array(poses)[:, :2] == pytest.approx(replayed[:, :2], abs=1e-6)
     assert np.abs(np.sin(np.array(poses)[:, 2] - replayed[:, 2])).max() < 1e-6

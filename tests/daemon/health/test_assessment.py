@@ -16,7 +16,6 @@ from daemon.health.present_faults import PresentFaults
 from daemon.health.report import NAMES
 from daemon.runtime import heartbeat as module
 from daemon.runtime.heartbeat import Heartbeat
-from hal.clock import run_virtual
 from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused
 from hal.lidar import Link
 
@@ -287,47 +286,42 @@ def test_the_watchdog_is_fed_only_while_cycles_go_on(monkeypatch: pytest.MonkeyP
     assert len(said) == 4, "the first beat knows no earlier one"
 
 
-def test_the_heart_beats_once_a_second_and_tells_lateness() -> None:
+@pytest.mark.virtual
+async def test_the_heart_beats_once_a_second_and_tells_lateness() -> None:
     seen: list[float] = []
 
-    async def go() -> None:
-        def sample(lateness: float) -> Vitals:
-            seen.append(lateness)
-            return Vitals(asyncio.get_running_loop().time())
+    def sample(lateness: float) -> Vitals:
+        seen.append(lateness)
+        return Vitals(asyncio.get_running_loop().time())
 
-        beating = asyncio.create_task(Heartbeat(sample, str).run())
-        await asyncio.sleep(10.5)
-        beating.cancel()
-
-    run_virtual(go())
+    beating = asyncio.create_task(Heartbeat(sample, str).run())
+    await asyncio.sleep(10.5)
+    beating.cancel()
     assert len(seen) == 10
     assert max(seen) < 1e-6
 
 
-def test_after_a_beat_that_came_late_the_next_one_is_a_second_away(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_after_a_beat_that_came_late_the_next_one_is_a_second_away(monkeypatch: pytest.MonkeyPatch) -> None:
     """At once it would find nothing but what the late one has found."""
     monkeypatch.setattr(module, "BEAT_S", 0.05)
     beats: list[float] = []
+    loop = asyncio.get_running_loop()
 
-    async def go() -> None:
-        loop = asyncio.get_running_loop()
+    def sample(lateness: float) -> Vitals:
+        beats.append(loop.time())
+        return Vitals(loop.time())
 
-        def sample(lateness: float) -> Vitals:
-            beats.append(loop.time())
-            return Vitals(loop.time())
-
-        beating = asyncio.create_task(Heartbeat(sample, str).run())
-        await asyncio.sleep(0.06)
-        time.sleep(0.23)  # noqa: ASYNC251  # the loop stands still: that is what is tested
-        await asyncio.sleep(0.2)
-        beating.cancel()
-
-    asyncio.run(go())
+    beating = asyncio.create_task(Heartbeat(sample, str).run())
+    await asyncio.sleep(0.06)
+    time.sleep(0.23)  # noqa: ASYNC251  # the loop stands still: that is what is tested
+    await asyncio.sleep(0.2)
+    beating.cancel()
     assert len(beats) >= 3
     assert min(after - before for before, after in pairwise(beats)) > 0.045
 
 
-def test_a_beat_that_fails_is_said_once_and_feeds_no_watchdog_and_the_next_is_tried(
+@pytest.mark.virtual
+async def test_a_beat_that_fails_is_said_once_and_feeds_no_watchdog_and_the_next_is_tried(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     said: list[str] = []
@@ -341,13 +335,10 @@ def test_a_beat_that_fails_is_said_once_and_feeds_no_watchdog_and_the_next_is_tr
             raise OSError(24, "Too many open files")
         return Vitals(float(beats), cycles=beats)
 
-    async def go() -> None:
-        beating = asyncio.create_task(Heartbeat(sample, str).run())
-        await asyncio.sleep(10.5)
-        assert not beating.done()
-        beating.cancel()
-
-    run_virtual(go())
+    beating = asyncio.create_task(Heartbeat(sample, str).run())
+    await asyncio.sleep(10.5)
+    assert not beating.done()
+    beating.cancel()
     assert beats == 10
     assert said == ["WATCHDOG=1"] * 6
     assert caplog.text.count("a heartbeat has failed") == 2

@@ -22,7 +22,7 @@ from daemon.runtime.heartbeat import Heartbeat
 from daemon.runtime.worker import URGENT, ThreadWorker
 from daemon.snapshot import Part, Thread
 from estimator.measurements import Job
-from hal.clock import LoopClock, run_virtual
+from hal.clock import LoopClock
 from hal.lidar import LidarStatus
 from tests.daemon.scenarios.test_daemon import SETTINGS
 
@@ -114,7 +114,8 @@ def test_the_condition_is_one_object_until_something_changes(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("thread", [Thread.SOLVER, Thread.SEARCH])
-def test_background_work_that_hangs_is_a_fault_within_seconds_and_starves_the_watchdog(
+@pytest.mark.virtual
+async def test_background_work_that_hangs_is_a_fault_within_seconds_and_starves_the_watchdog(
     thread: Thread, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The whole daemon, whose worker waits for ever; the map gives such a job up only after many keyframes."""
@@ -122,30 +123,26 @@ def test_background_work_that_hangs_is_a_fault_within_seconds_and_starves_the_wa
     fed: list[str] = []
     monkeypatch.setattr("daemon.runtime.heartbeat.notify", lambda *words: fed.extend(words))
     go = threading.Event()
-
-    async def run() -> None:
-        clock = LoopClock(asyncio.get_running_loop())
-        daemon = app.Daemon(SETTINGS, Environment(clock, make_worker=ThreadWorker, draw_map_id=lambda: 1))
-        worker = daemon.cycle.parts.worker
-        assert isinstance(worker, ThreadWorker)
-        try:
-            for _ in range(3):
-                daemon.cycle.cycles += 1
-                daemon.heartbeat.beat(0.0)
-            assert daemon.heartbeat.faults == ()
-            assert fed.count("WATCHDOG=1") == 3
-            worker.submit([Job(1, URGENT if thread is Thread.SOLVER else URGENT + 1, go.wait)])
-            end = time.monotonic() + 5.0
-            while Fault.THREAD_HANGS not in daemon.heartbeat.faults and time.monotonic() < end:
-                time.sleep(0.01)  # noqa: ASYNC251  # the thread's time is the real one
-                fed.clear()
-                daemon.cycle.cycles += 1
-                daemon.heartbeat.beat(0.0)
-            assert daemon.threads.hanging == {thread}
-            assert daemon.heartbeat.faults == (Fault.THREAD_HANGS,)
-            assert "WATCHDOG=1" not in fed
-        finally:
-            go.set()
-            worker.close()
-
-    run_virtual(run())
+    clock = LoopClock(asyncio.get_running_loop())
+    daemon = app.Daemon(SETTINGS, Environment(clock, make_worker=ThreadWorker, draw_map_id=lambda: 1))
+    worker = daemon.cycle.parts.worker
+    assert isinstance(worker, ThreadWorker)
+    try:
+        for _ in range(3):
+            daemon.cycle.cycles += 1
+            daemon.heartbeat.beat(0.0)
+        assert daemon.heartbeat.faults == ()
+        assert fed.count("WATCHDOG=1") == 3
+        worker.submit([Job(1, URGENT if thread is Thread.SOLVER else URGENT + 1, go.wait)])
+        end = time.monotonic() + 5.0
+        while Fault.THREAD_HANGS not in daemon.heartbeat.faults and time.monotonic() < end:
+            time.sleep(0.01)  # noqa: ASYNC251  # the thread's time is the real one
+            fed.clear()
+            daemon.cycle.cycles += 1
+            daemon.heartbeat.beat(0.0)
+        assert daemon.threads.hanging == {thread}
+        assert daemon.heartbeat.faults == (Fault.THREAD_HANGS,)
+        assert "WATCHDOG=1" not in fed
+    finally:
+        go.set()
+        worker.close()

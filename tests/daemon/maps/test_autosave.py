@@ -21,62 +21,53 @@ from tests.daemon.maps.autosave_bench import Bench
 from tests.daemon.support.map_maker import content
 
 
-def test_saved_after_a_minute_then_every_five_and_only_if_something_has_changed(tmp_path: Path) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        bench.drive()
-        await bench.turn(FIRST_S - 1.0)
-        assert bench.files == 0
-        await bench.turn(1.0)
-        assert bench.autosaver.saves == 1
-        await bench.turn(2.0 * EVERY_S)
-        assert bench.autosaver.saves == 1, "nothing has changed"
-        bench.drive()
-        await bench.turn(0.0)
-        assert bench.autosaver.saves == 2
-        bench.drive()
-        await bench.turn(EVERY_S - 1.0)
-        assert bench.autosaver.saves == 2
-        await bench.turn(1.0)
-        assert bench.autosaver.saves == 3
-
-    asyncio.run(run())
+async def test_saved_after_a_minute_then_every_five_and_only_if_something_has_changed(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.drive()
+    await bench.turn(FIRST_S - 1.0)
+    assert bench.files == 0
+    await bench.turn(1.0)
+    assert bench.autosaver.saves == 1
+    await bench.turn(2.0 * EVERY_S)
+    assert bench.autosaver.saves == 1, "nothing has changed"
+    bench.drive()
+    await bench.turn(0.0)
+    assert bench.autosaver.saves == 2
+    bench.drive()
+    await bench.turn(EVERY_S - 1.0)
+    assert bench.autosaver.saves == 2
+    await bench.turn(1.0)
+    assert bench.autosaver.saves == 3
 
 
-def test_what_is_saved_says_whose_it_is(tmp_path: Path) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        bench.drive()
-        await bench.turn(FIRST_S)
-        start = Store(tmp_path).load()
-        assert start is not None
-        meta = start.stored.meta
-        assert (meta.map_id, meta.robot, meta.survey, meta.session) == (0x77, "robot", "digest", 1)
-        assert meta.saved == pytest.approx(1.5e9 + bench.clock.t)
-        assert bench.store is not None
-        bench.store.close()
-        later = Bench(tmp_path, about=About(), start=start)
-        later.drive()
-        await later.turn(FIRST_S)
-        again = Store(tmp_path).load()
-        assert again is not None
-        assert (again.stored.meta.session, again.stored.meta.survey) == (2, "digest")
-
-    asyncio.run(run())
+async def test_what_is_saved_says_whose_it_is(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.drive()
+    await bench.turn(FIRST_S)
+    start = Store(tmp_path).load()
+    assert start is not None
+    meta = start.stored.meta
+    assert (meta.map_id, meta.robot, meta.survey, meta.session) == (0x77, "robot", "digest", 1)
+    assert meta.saved == pytest.approx(1.5e9 + bench.clock.t)
+    assert bench.store is not None
+    bench.store.close()
+    later = Bench(tmp_path, about=About(), start=start)
+    later.drive()
+    await later.turn(FIRST_S)
+    again = Store(tmp_path).load()
+    assert again is not None
+    assert (again.stored.meta.session, again.stored.meta.survey) == (2, "digest")
 
 
-def test_done_is_said_when_it_is_on_the_disk(tmp_path: Path) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        bench.drive()
-        bench.autosaver.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
-        bench.autosaver.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
-        assert bench.told == []
-        for _ in range(2):
-            await bench.turn()
-        assert bench.told == ["1", "2"], "the second was asked while the first was under way: it may know more"
-
-    asyncio.run(run())
+async def test_done_is_said_when_it_is_on_the_disk(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.drive()
+    bench.autosaver.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
+    bench.autosaver.ask(lambda reason: bench.told.append(f"{reason}{bench.files}"))
+    assert bench.told == []
+    for _ in range(2):
+        await bench.turn()
+    assert bench.told == ["1", "2"], "the second was asked while the first was under way: it may know more"
 
 
 @pytest.mark.parametrize(
@@ -87,194 +78,163 @@ def test_done_is_said_when_it_is_on_the_disk(tmp_path: Path) -> None:
         (lambda bench: bench.autosaver.loaded(), ADRIFT),
     ],
 )
-def test_what_cannot_be_saved_is_refused_with_the_reason(
+async def test_what_cannot_be_saved_is_refused_with_the_reason(
     tmp_path: Path, change: Callable[[Bench], None], reason: str
 ) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path, start=Start(content(), read(content())))
-        change(bench)
+    bench = Bench(tmp_path, start=Start(content(), read(content())))
+    change(bench)
+    bench.autosaver.ask(bench.told.append)
+    assert bench.told == [reason]
+
+
+async def test_without_a_folder_and_for_localisation_only_it_is_refused(tmp_path: Path) -> None:
+    for bench, reason in (
+        (Bench(tmp_path, kept=False), NO_FOLDER),
+        (Bench(tmp_path, about=About(localise=True)), FIXED),
+    ):
+        bench.drive()
         bench.autosaver.ask(bench.told.append)
+        await bench.turn(10.0 * EVERY_S)
+        await bench.autosaver.finish()
         assert bench.told == [reason]
-
-    asyncio.run(run())
-
-
-def test_without_a_folder_and_for_localisation_only_it_is_refused(tmp_path: Path) -> None:
-    async def run() -> None:
-        for bench, reason in (
-            (Bench(tmp_path, kept=False), NO_FOLDER),
-            (Bench(tmp_path, about=About(localise=True)), FIXED),
-        ):
-            bench.drive()
-            bench.autosaver.ask(bench.told.append)
-            await bench.turn(10.0 * EVERY_S)
-            await bench.autosaver.finish()
-            assert bench.told == [reason]
-            assert bench.files == 0
-
-    asyncio.run(run())
+        assert bench.files == 0
 
 
-def test_a_disk_that_cannot_be_written_is_said_once_and_tried_again(
+async def test_a_disk_that_cannot_be_written_is_said_once_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
+    bench = Bench(tmp_path)
+    assert bench.store is not None
+    save = bench.store.save
 
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        save = bench.store.save
+    def full(data: bytes, map_id: int) -> Path:
+        raise OSError(errno.EROFS, "Read-only file system")
 
-        def full(data: bytes, map_id: int) -> Path:
-            raise OSError(errno.EROFS, "Read-only file system")
-
-        monkeypatch.setattr(bench.store, "save", full)
-        bench.drive()
-        bench.autosaver.ask(bench.told.append)
-        for _ in range(3):
-            await bench.turn(RETRY_S)
-        assert "Read-only file system" in bench.told[0]
-        assert "Read-only file system" in bench.autosaver.error
-        assert caplog.text.count("the map cannot be saved") == 1
-        monkeypatch.setattr(bench.store, "save", save)
-        with caplog.at_level(logging.INFO):
-            await bench.turn(RETRY_S)
-        assert bench.autosaver.error == ""
-        assert bench.autosaver.saves == 1
-        assert "map saved" in caplog.text
-
-    asyncio.run(run())
+    monkeypatch.setattr(bench.store, "save", full)
+    bench.drive()
+    bench.autosaver.ask(bench.told.append)
+    for _ in range(3):
+        await bench.turn(RETRY_S)
+    assert "Read-only file system" in bench.told[0]
+    assert "Read-only file system" in bench.autosaver.error
+    assert caplog.text.count("the map cannot be saved") == 1
+    monkeypatch.setattr(bench.store, "save", save)
+    with caplog.at_level(logging.INFO):
+        await bench.turn(RETRY_S)
+    assert bench.autosaver.error == ""
+    assert bench.autosaver.saves == 1
+    assert "map saved" in caplog.text
 
 
-def test_a_defect_in_the_packing_is_told_in_full_and_ends_nothing(
+async def test_a_defect_in_the_packing_is_told_in_full_and_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        bench.drive()
-        monkeypatch.setattr(bench.autosaver, "_packed", lambda image: 1 // 0)
-        await bench.turn(FIRST_S)
-        assert "ZeroDivisionError" in bench.autosaver.error
-        assert "Traceback" in caplog.text
-        monkeypatch.undo()
-        await bench.turn(RETRY_S)
-        assert bench.autosaver.saves == 1
-
-    asyncio.run(run())
+    bench = Bench(tmp_path)
+    bench.drive()
+    monkeypatch.setattr(bench.autosaver, "_packed", lambda image: 1 // 0)
+    await bench.turn(FIRST_S)
+    assert "ZeroDivisionError" in bench.autosaver.error
+    assert "Traceback" in caplog.text
+    monkeypatch.undo()
+    await bench.turn(RETRY_S)
+    assert bench.autosaver.saves == 1
 
 
 @pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
-def test_a_save_that_cannot_begin_is_told_and_tried_again(
+async def test_a_save_that_cannot_begin_is_told_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
+    bench = Bench(tmp_path)
+    bench.drive()
+    await bench.turn(FIRST_S)
+    bench.state, bench.map_id = new_state(), 0x78
+
+    def fail(*given: object) -> None:
+        raise failure
+
+    with monkeypatch.context() as without:
+        without.setattr(*((threading.Thread, "start") if str(failure) else (bench.autosaver, "_image")), fail)
         bench.drive()
-        await bench.turn(FIRST_S)
-        bench.state, bench.map_id = new_state(), 0x78
-
-        def fail(*given: object) -> None:
-            raise failure
-
-        with monkeypatch.context() as without:
-            without.setattr(*((threading.Thread, "start") if str(failure) else (bench.autosaver, "_image")), fail)
-            bench.drive()
-            bench.state.map.keyframes[0] = None  # type: ignore[assignment]  # there is something of a map
-            bench.autosaver.ask(bench.told.append)
-            bench.state.map.keyframes.clear()
-        assert len(bench.told) == 1
-        assert repr(failure) in bench.told[0]
-        assert repr(failure) in bench.autosaver.error
-        assert bench.autosaver.busy_since is None
-        await bench.turn(RETRY_S)
-        assert bench.autosaver.error == ""
-        assert bench.autosaver.saves == 2, "begun anew, which must not be forgotten"
-
-    asyncio.run(run())
+        bench.state.map.keyframes[0] = None  # type: ignore[assignment]  # there is something of a map
+        bench.autosaver.ask(bench.told.append)
+        bench.state.map.keyframes.clear()
+    assert len(bench.told) == 1
+    assert repr(failure) in bench.told[0]
+    assert repr(failure) in bench.autosaver.error
+    assert bench.autosaver.busy_since is None
+    await bench.turn(RETRY_S)
+    assert bench.autosaver.error == ""
+    assert bench.autosaver.saves == 2, "begun anew, which must not be forgotten"
 
 
-def test_reset_is_kept_at_once_so_that_the_old_map_does_not_come_back(tmp_path: Path) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        bench.drive()
-        await bench.turn(FIRST_S)
-        bench.state, bench.map_id = new_state(), 0x78
-        await bench.turn(1.0)
-        assert bench.autosaver.saves == 2
-        start = Store(tmp_path).load()
-        assert start is not None
-        assert start.stored.meta.map_id == 0x78
-        assert len(start.stored.tables["submap.key"]) == 0
-        assert bench.files == 2, "the old one stays as a map of its own"
-        await bench.turn(10.0 * EVERY_S)
-        assert bench.autosaver.saves == 2
-
-    asyncio.run(run())
+async def test_reset_is_kept_at_once_so_that_the_old_map_does_not_come_back(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.drive()
+    await bench.turn(FIRST_S)
+    bench.state, bench.map_id = new_state(), 0x78
+    await bench.turn(1.0)
+    assert bench.autosaver.saves == 2
+    start = Store(tmp_path).load()
+    assert start is not None
+    assert start.stored.meta.map_id == 0x78
+    assert len(start.stored.tables["submap.key"]) == 0
+    assert bench.files == 2, "the old one stays as a map of its own"
+    await bench.turn(10.0 * EVERY_S)
+    assert bench.autosaver.saves == 2
 
 
-def test_a_reset_that_could_not_be_kept_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        bench.drive()
-        await bench.turn(FIRST_S)
-        bench.state, bench.map_id = new_state(), 0x78
-        packed = bench.autosaver._packed
-        monkeypatch.setattr(bench.autosaver, "_packed", lambda image: 1 // 0)
-        await bench.turn(1.0)
-        monkeypatch.setattr(bench.autosaver, "_packed", packed)
-        await bench.turn(RETRY_S)
-        assert bench.autosaver.saves == 2
-        assert bench.files == 2
-
-    asyncio.run(run())
+async def test_a_reset_that_could_not_be_kept_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(tmp_path)
+    bench.drive()
+    await bench.turn(FIRST_S)
+    bench.state, bench.map_id = new_state(), 0x78
+    packed = bench.autosaver._packed
+    monkeypatch.setattr(bench.autosaver, "_packed", lambda image: 1 // 0)
+    await bench.turn(1.0)
+    monkeypatch.setattr(bench.autosaver, "_packed", packed)
+    await bench.turn(RETRY_S)
+    assert bench.autosaver.saves == 2
+    assert bench.files == 2
 
 
-def test_a_map_just_loaded_is_not_saved_until_the_robot_knows_its_place_in_it(tmp_path: Path) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path, start=Start(content(), read(content())))
-        bench.autosaver.loaded()
-        assert bench.state is not None
-        bench.state.map.next_key += 9
-        await bench.turn(EVERY_S)
-        await bench.autosaver.finish()
-        assert bench.files == 0
-        bench.drive()
-        await bench.turn(EVERY_S)
-        assert bench.files == 1
-
-    asyncio.run(run())
+async def test_a_map_just_loaded_is_not_saved_until_the_robot_knows_its_place_in_it(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, start=Start(content(), read(content())))
+    bench.autosaver.loaded()
+    assert bench.state is not None
+    bench.state.map.next_key += 9
+    await bench.turn(EVERY_S)
+    await bench.autosaver.finish()
+    assert bench.files == 0
+    bench.drive()
+    await bench.turn(EVERY_S)
+    assert bench.files == 1
 
 
-def test_at_the_stop_what_is_new_is_saved_and_told_and_the_folder_is_free(
+async def test_at_the_stop_what_is_new_is_saved_and_told_and_the_folder_is_free(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        bench.drive()
-        await bench.turn(FIRST_S)
-        bench.drive()
-        caplog.clear()
-        with caplog.at_level(logging.INFO):
-            await bench.autosaver.finish()
-        assert caplog.text.count("map saved") == 1
-        assert bench.files == 2
+    bench = Bench(tmp_path)
+    bench.drive()
+    await bench.turn(FIRST_S)
+    bench.drive()
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
         await bench.autosaver.finish()
-        assert bench.files == 2
-        Store(tmp_path).save(content(), 5)
+    assert caplog.text.count("map saved") == 1
+    assert bench.files == 2
+    await bench.autosaver.finish()
+    assert bench.files == 2
+    Store(tmp_path).save(content(), 5)
 
-    asyncio.run(run())
 
-
-def test_a_stop_does_not_wait_for_ever(
+async def test_a_stop_does_not_wait_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        bench.drive()
-        monkeypatch.setattr(autosave, "STOP_S", 0.1)
-        monkeypatch.setattr(bench.autosaver, "_packed", lambda image: time.sleep(0.6))
-        await bench.autosaver.finish()
-        assert "the one before stays" in caplog.text
-        await asyncio.sleep(0.7)
-
-    asyncio.run(run())
+    bench = Bench(tmp_path)
+    bench.drive()
+    monkeypatch.setattr(autosave, "STOP_S", 0.1)
+    monkeypatch.setattr(bench.autosaver, "_packed", lambda image: time.sleep(0.6))
+    await bench.autosaver.finish()
+    assert "the one before stays" in caplog.text
+    await asyncio.sleep(0.7)

@@ -24,41 +24,35 @@ def second(folder: Path) -> tuple[Store, Bench]:
     return other, bench
 
 
-def test_a_map_that_was_refused_is_a_fault_until_one_is_saved(tmp_path: Path) -> None:
-    async def run() -> None:
-        tmp_path.joinpath("map-00000077-00000001.lumimap").write_bytes(b"x")
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.store.load()
-        assert bench.autosaver.refused
-        bench.drive()
-        await bench.turn(FIRST_S)
-        assert not bench.autosaver.refused
-
-    asyncio.run(run())
+async def test_a_map_that_was_refused_is_a_fault_until_one_is_saved(tmp_path: Path) -> None:
+    tmp_path.joinpath("map-00000077-00000001.lumimap").write_bytes(b"x")
+    bench = Bench(tmp_path)
+    assert bench.store is not None
+    bench.store.load()
+    assert bench.autosaver.refused
+    bench.drive()
+    await bench.turn(FIRST_S)
+    assert not bench.autosaver.refused
 
 
-def test_a_folder_of_another_process_is_a_fault_from_the_start_until_a_save_is_done(
+async def test_a_folder_of_another_process_is_a_fault_from_the_start_until_a_save_is_done(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def run() -> None:
-        other, bench = second(tmp_path)
-        autosaver = MapAutosaver(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
-        assert autosaver.fault
-        bench.autosaver = autosaver
-        bench.drive()
-        await bench.turn(FIRST_S)
-        assert autosaver.fault
-        assert caplog.text.count("another process keeps its maps there") == 1
-        await autosaver.finish()
-        assert "it is tried again" not in caplog.text
-        other.close()
-        bench.drive()
-        await bench.turn(RETRY_S)
-        assert not autosaver.fault
-        assert bench.files == 1
-
-    asyncio.run(run())
+    other, bench = second(tmp_path)
+    autosaver = MapAutosaver(bench.store, None, lambda: bench.state, lambda: 0x77, About(), bench.clock)
+    assert autosaver.fault
+    bench.autosaver = autosaver
+    bench.drive()
+    await bench.turn(FIRST_S)
+    assert autosaver.fault
+    assert caplog.text.count("another process keeps its maps there") == 1
+    await autosaver.finish()
+    assert "it is tried again" not in caplog.text
+    other.close()
+    bench.drive()
+    await bench.turn(RETRY_S)
+    assert not autosaver.fault
+    assert bench.files == 1
 
 
 @pytest.mark.parametrize("loaded", [True, False])
@@ -92,66 +86,57 @@ def test_a_folder_that_has_become_free_is_no_fault_any_more_though_there_is_noth
     assert f"maps can be kept in {tmp_path} from now on" in caplog.text
 
 
-def test_what_is_wrong_with_the_folder_may_change(tmp_path: Path) -> None:
-    async def run() -> None:
-        folder = tmp_path / "maps"
-        folder.write_text("no folder")
-        bench = Bench(folder)
-        assert bench.store is not None
-        bench.store.claim()
-        bench.autosaver = MapAutosaver(bench.store, None, lambda: None, lambda: 0x77, About(), bench.clock)
-        first = bench.autosaver.error
-        folder.unlink()
-        other = Store(folder)
-        other.claim()
-        await bench.turn(LOOK_S)
-        assert bench.autosaver.error not in ("", first)
-        assert "another process" in bench.autosaver.error
-        other.close()
-        await bench.turn(LOOK_S)
-        assert bench.autosaver.error == ""
-        await bench.autosaver.finish()
-
-    asyncio.run(run())
+async def test_what_is_wrong_with_the_folder_may_change(tmp_path: Path) -> None:
+    folder = tmp_path / "maps"
+    folder.write_text("no folder")
+    bench = Bench(folder)
+    assert bench.store is not None
+    bench.store.claim()
+    bench.autosaver = MapAutosaver(bench.store, None, lambda: None, lambda: 0x77, About(), bench.clock)
+    first = bench.autosaver.error
+    folder.unlink()
+    other = Store(folder)
+    other.claim()
+    await bench.turn(LOOK_S)
+    assert bench.autosaver.error not in ("", first)
+    assert "another process" in bench.autosaver.error
+    other.close()
+    await bench.turn(LOOK_S)
+    assert bench.autosaver.error == ""
+    await bench.autosaver.finish()
 
 
-def test_a_save_that_was_asked_for_and_failed_is_tried_again_though_nothing_is_new(
+async def test_a_save_that_was_asked_for_and_failed_is_tried_again_though_nothing_is_new(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def run() -> None:
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.drive()
-        await bench.turn(FIRST_S)
+    bench = Bench(tmp_path)
+    assert bench.store is not None
+    bench.drive()
+    await bench.turn(FIRST_S)
 
-        def full(data: bytes, map_id: int) -> Path:
-            raise OSError(errno.ENOSPC, "No space left on device")
+    def full(data: bytes, map_id: int) -> Path:
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-        with monkeypatch.context() as without:
-            without.setattr(bench.store, "save", full)
-            bench.autosaver.ask(bench.told.append)
-            await bench.turn()
-            await bench.turn(RETRY_S)
-        assert bench.autosaver.fault
+    with monkeypatch.context() as without:
+        without.setattr(bench.store, "save", full)
+        bench.autosaver.ask(bench.told.append)
+        await bench.turn()
         await bench.turn(RETRY_S)
-        assert not bench.autosaver.fault
-        assert bench.autosaver.saves == 2
-        await bench.turn(10.0 * EVERY_S)
-        assert bench.autosaver.saves == 2
+    assert bench.autosaver.fault
+    await bench.turn(RETRY_S)
+    assert not bench.autosaver.fault
+    assert bench.autosaver.saves == 2
+    await bench.turn(10.0 * EVERY_S)
+    assert bench.autosaver.saves == 2
 
-    asyncio.run(run())
 
-
-def test_at_the_stop_what_there_is_is_saved_though_the_folder_has_not_been_looked_at(
+async def test_at_the_stop_what_there_is_is_saved_though_the_folder_has_not_been_looked_at(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def run() -> None:
-        other, bench = second(tmp_path)
-        other.close()
-        bench.drive()
-        bench.clock.t += LOOK_S
-        await bench.autosaver.finish()
-        assert bench.files == 1
-
-    asyncio.run(run())
+    other, bench = second(tmp_path)
+    other.close()
+    bench.drive()
+    bench.clock.t += LOOK_S
+    await bench.autosaver.finish()
+    assert bench.files == 1
     assert "could not be saved" not in caplog.text

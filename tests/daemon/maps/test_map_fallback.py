@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -60,30 +59,27 @@ def test_a_map_that_was_let_go_of_is_followed_by_one_of_another_identity() -> No
     assert ids[-1] == another(ids[0], step.result.t_mono) != another(ids[0], step.result.t_mono + 10.0)
 
 
-def test_a_map_set_aside_is_not_saved_over_and_what_follows_it_has_a_file_of_its_own(tmp_path: Path) -> None:
-    async def run() -> None:
-        store = Store(tmp_path)
-        stored = content(Shape(map_id=0x77))
-        old = store.save(stored, 0x77)
-        store.close()
-        bench = Bench(tmp_path, start=Start(stored, read(stored)))
-        state = bench.state
-        assert state is not None
-        first = max(state.map.graph.submaps)
-        state.map.parts.detached, since = first, state.map.graph.submaps[first].first
-        bench.autosaver.loaded()
-        unaligned_map.set_aside(state, Trial(first=first, since=since), 0.0, Seek())
-        state.map.next_key += 30
-        await bench.turn(FIRST_S)
-        await bench.turn(2.0 * EVERY_S)
-        assert bench.autosaver.saves == 0
-        bench.autosaver.ask(bench.told.append)
-        assert bench.told == [ADRIFT]
-        state.map.parts.aside, bench.map_id = None, 0x78
-        await bench.turn(1.0)
-        assert bench.autosaver.saves == 1
-        assert old.read_bytes() == stored
-        ids = sorted(one.map_id for one in Store(tmp_path).generations())
-        assert ids == [0x77, 0x78]
-
-    asyncio.run(run())
+async def test_a_map_set_aside_is_not_saved_over_and_what_follows_it_has_a_file_of_its_own(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    stored = content(Shape(map_id=0x77))
+    old = store.save(stored, 0x77)
+    store.close()
+    bench = Bench(tmp_path, start=Start(stored, read(stored)))
+    state = bench.state
+    assert state is not None
+    first = max(state.map.graph.submaps)
+    state.map.parts.detached, since = first, state.map.graph.submaps[first].first
+    bench.autosaver.loaded()
+    unaligned_map.set_aside(state, Trial(first=first, since=since), 0.0, Seek())
+    state.map.next_key += 30
+    await bench.turn(FIRST_S)
+    await bench.turn(2.0 * EVERY_S)
+    assert bench.autosaver.saves == 0
+    bench.autosaver.ask(bench.told.append)
+    assert bench.told == [ADRIFT]
+    state.map.parts.aside, bench.map_id = None, 0x78
+    await bench.turn(1.0)
+    assert bench.autosaver.saves == 1
+    assert old.read_bytes() == stored
+    ids = sorted(one.map_id for one in Store(tmp_path).generations())
+    assert ids == [0x77, 0x78]

@@ -226,43 +226,38 @@ def test_who_only_looks_or_uses_a_map_as_it_is_counts_nothing(tmp_path: Path) ->
     assert not (tmp_path / NAME).exists()
 
 
-def test_a_run_is_proved_when_it_has_lasted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_run_is_proved_when_it_has_lasted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(autosave, "BEAT_S", 0.01)
-
-    async def run() -> None:
-        store_with(tmp_path, 1).close()
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.store.claim()
-        bench.store.load()
-        bench.store.trial.begin()
-        bench.autosaver.loaded()
-        beats = asyncio.create_task(bench.autosaver.run())
-        bench.clock.t += PROOF_S - 0.1
-        await asyncio.sleep(0.1)
-        assert (tmp_path / NAME).exists()
-        bench.clock.t += 0.1
-        async with asyncio.timeout(20.0):
-            while (tmp_path / NAME).exists():  # noqa: ASYNC110  # nothing tells of it
-                await asyncio.sleep(0.01)
-        beats.cancel()
-
-    asyncio.run(run())
+    store_with(tmp_path, 1).close()
+    bench = Bench(tmp_path)
+    assert bench.store is not None
+    bench.store.claim()
+    bench.store.load()
+    bench.store.trial.begin()
+    bench.autosaver.loaded()
+    beats = asyncio.create_task(bench.autosaver.run())
+    bench.clock.t += PROOF_S - 0.1
+    await asyncio.sleep(0.1)
+    assert (tmp_path / NAME).exists()
+    bench.clock.t += 0.1
+    async with asyncio.timeout(20.0):
+        while (tmp_path / NAME).exists():  # noqa: ASYNC110  # nothing tells of it
+            await asyncio.sleep(0.01)
+    beats.cancel()
 
 
 @pytest.mark.parametrize("in_order", [True, False])
-def test_a_stop_in_order_does_not_count_and_a_defect_does_and_saves_nothing(tmp_path: Path, in_order: bool) -> None:
-    async def run() -> None:
-        store_with(tmp_path, 1).close()
-        bench = Bench(tmp_path)
-        assert bench.store is not None
-        bench.store.claim()
-        bench.store.load()
-        bench.store.trial.begin()
-        bench.autosaver.loaded()
-        bench.drive()
-        await bench.autosaver.finish(in_order)
-        assert json.loads((tmp_path / NAME).read_bytes())["count"] == (0 if in_order else 1)
-        assert (len(names(tmp_path)) > 1) is in_order
-
-    asyncio.run(run())
+async def test_a_stop_in_order_does_not_count_and_a_defect_does_and_saves_nothing(
+    tmp_path: Path, in_order: bool
+) -> None:
+    store_with(tmp_path, 1).close()
+    bench = Bench(tmp_path)
+    assert bench.store is not None
+    bench.store.claim()
+    bench.store.load()
+    bench.store.trial.begin()
+    bench.autosaver.loaded()
+    bench.drive()
+    await bench.autosaver.finish(in_order)
+    assert json.loads((tmp_path / NAME).read_bytes())["count"] == (0 if in_order else 1)
+    assert (len(names(tmp_path)) > 1) is in_order

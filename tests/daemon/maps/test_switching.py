@@ -342,22 +342,18 @@ class _Later:
         return self.t
 
 
-def test_the_map_switched_to_is_not_taken_for_one_begun_anew(tmp_path: Path) -> None:
+async def test_the_map_switched_to_is_not_taken_for_one_begun_anew(tmp_path: Path) -> None:
     """Else it would be saved at once, without its name and without what a person has surveyed of it."""
     parts, graph = SimpleNamespace(unproved=None, detached=None), SimpleNamespace(closures=3)
     held = SimpleNamespace(graph=graph, parts=parts, next_key=9, keyframes={1: None})
     state: Any = SimpleNamespace(map=held, light=None)
     used, start = [1], SimpleNamespace()
     saved: list[object] = []
-
-    async def body() -> None:
-        clock: Any = _Later()
-        autosaver = MapAutosaver(Store(tmp_path, mend=False), None, lambda: state, lambda: used[0], About(), clock)
-        autosaver._image = saved.append  # type: ignore[method-assign,assignment]  # what would be saved
-        autosaver.switched(2, start)  # type: ignore[arg-type]  # only kept
-        used[0] = 2
-        autosaver._go_on()
-        assert saved == []
-        assert autosaver._start is start
-
-    asyncio.run(body())
+    clock: Any = _Later()
+    autosaver = MapAutosaver(Store(tmp_path, mend=False), None, lambda: state, lambda: used[0], About(), clock)
+    autosaver._image = saved.append  # type: ignore[method-assign,assignment]  # what would be saved
+    autosaver.switched(2, start)  # type: ignore[arg-type]  # only kept
+    used[0] = 2
+    autosaver._go_on()
+    assert saved == []
+    assert autosaver._start is start

@@ -18,7 +18,7 @@ from daemon import app
 from daemon.app import Daemon, Environment
 from daemon.cli import parser, run
 from daemon.system import console
-from hal.clock import LoopClock, run_virtual
+from hal.clock import LoopClock
 from hal.fake.transport.memory_host import FakeOpener
 from tests.daemon.scenarios.test_daemon import SETTINGS
 from tests.daemon.support.whole_daemon import during
@@ -72,21 +72,18 @@ def test_a_stop_ends_the_wait(tmp_path: Path, manager: socket.socket) -> None:
         process.wait()
 
 
-def test_a_start_that_hangs_is_not_excused_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.virtual
+async def test_a_start_that_hangs_is_not_excused_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     """The service manager is asked for more time while the estimator is loaded; then it may begin anew."""
     asked: list[float] = []
+    loop = asyncio.get_running_loop()
+    clock = LoopClock(loop, utc_at_zero=1.7e9)
 
-    async def go() -> None:
-        loop = asyncio.get_running_loop()
-        clock = LoopClock(loop, utc_at_zero=1.7e9)
+    def notified(*words: str) -> None:
+        asked.extend(clock.now() for word in words if word.startswith("EXTEND_TIMEOUT_USEC="))
 
-        def notified(*words: str) -> None:
-            asked.extend(clock.now() for word in words if word.startswith("EXTEND_TIMEOUT_USEC="))
-
-        monkeypatch.setattr(app, "notify", notified)
-        world = Environment(clock, opener=FakeOpener(clock), warm_up=asyncio.Event().wait)
-        await during(Daemon(SETTINGS, world), asyncio.sleep(app.STARTING_S + 60.0))
-
-    run_virtual(go())
+    monkeypatch.setattr(app, "notify", notified)
+    world = Environment(clock, opener=FakeOpener(clock), warm_up=asyncio.Event().wait)
+    await during(Daemon(SETTINGS, world), asyncio.sleep(app.STARTING_S + 60.0))
     assert len(asked) == pytest.approx(app.STARTING_S, abs=2)
     assert asked[-1] - asked[0] < app.STARTING_S

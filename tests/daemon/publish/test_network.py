@@ -160,37 +160,34 @@ def test_a_plc_may_not_write_unless_it_is_allowed_to() -> None:
     assert run_virtual(go())[0] == 0x80 + 16
 
 
-def test_datagrams_of_odometry_and_gyro_reach_the_cycle_and_poses_go_out() -> None:
+@pytest.mark.virtual
+async def test_datagrams_of_odometry_and_gyro_reach_the_cycle_and_poses_go_out() -> None:
     port = free_port()
-
-    async def go() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-            receiver.bind(("127.0.0.1", 0))
-            receiver.setblocking(False)
-            where = f"127.0.0.1:{receiver.getsockname()[1]}"
-            bench = Bench(
-                settings(
-                    modbus=ModbusConfig(port=0),
-                    odometry=OdometryConfig(port=port),
-                    pose=PoseConfig(receivers=(where,)),
-                )
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.setblocking(False)
+        where = f"127.0.0.1:{receiver.getsockname()[1]}"
+        bench = Bench(
+            settings(
+                modbus=ModbusConfig(port=0),
+                odometry=OdometryConfig(port=port),
+                pose=PoseConfig(receivers=(where,)),
             )
-            await asyncio.sleep(2.5)
-            assert bench.snapshots[-1].odometry_ok is False
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-                sender.connect(("127.0.0.1", port))
-                for i in range(40):
-                    sender.send(encode(InputDatagram(ODOMETRY_MAGIC, 1, i, 0, 0.05 * i, (0.0, 0.0, 0.0))))
-                    sender.send(encode(InputDatagram(IMU_MAGIC, 1, i, 0, 0.05 * i, (0.0,))))
-                    await asyncio.sleep(0.05)
-            taken = bench.daemon.cycle.inbox.drain()
-            assert (taken.odometry_total, taken.imu_total) == (40, 40)
-            assert bench.snapshots[-1].odometry_ok is True
-            latest = registers.decode_datagram(receiver.recv(2000))
-            assert latest["seq"] == 1
-            await bench.end()
-
-    run_virtual(go())
+        )
+        await asyncio.sleep(2.5)
+        assert bench.snapshots[-1].odometry_ok is False
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.connect(("127.0.0.1", port))
+            for i in range(40):
+                sender.send(encode(InputDatagram(ODOMETRY_MAGIC, 1, i, 0, 0.05 * i, (0.0, 0.0, 0.0))))
+                sender.send(encode(InputDatagram(IMU_MAGIC, 1, i, 0, 0.05 * i, (0.0,))))
+                await asyncio.sleep(0.05)
+        taken = bench.daemon.cycle.inbox.drain()
+        assert (taken.odometry_total, taken.imu_total) == (40, 40)
+        assert bench.snapshots[-1].odometry_ok is True
+        latest = registers.decode_datagram(receiver.recv(2000))
+        assert latest["seq"] == 1
+        await bench.end()
 
 
 def test_a_receiver_that_cannot_be_sent_to_is_a_fault_until_it_can_be(caplog: pytest.LogCaptureFixture) -> None:
@@ -228,27 +225,24 @@ def test_without_any_socket_the_daemon_runs_for_its_sinks() -> None:
     assert run_virtual(go())[-1].state is State.TRACKING
 
 
-def test_a_pause_leaves_the_pose_to_others_until_it_is_resumed() -> None:
+@pytest.mark.virtual
+async def test_a_pause_leaves_the_pose_to_others_until_it_is_resumed() -> None:
     port = free_port()
-
-    async def go() -> None:
-        bench = Bench(settings(modbus=ModbusConfig(port=port, write=True)))
-        with closing(Plc(port)) as plc:
-            await asyncio.sleep(3.0)
-            await outside(lambda: plc.order(1, CommandCode.PAUSE, 0, 0, 0))
-            await asyncio.sleep(1.0)
-            assert await outside(plc.outcome) == (1, Outcome.DONE)
-            paused = [one for one in bench.snapshots if one.reason is Reason.PAUSED]
-            said = [one.state for one in paused if one.t_mono - paused[0].t_mono < 0.35]
-            assert len(said) >= 3
-            assert set(said) == {State.DEGRADED}, "it drives: without wheels it is LOST soon after"
-            await outside(lambda: plc.order(2, CommandCode.RESUME, 0, 0, 0))
-            await asyncio.sleep(1.0)
-            assert await outside(plc.outcome) == (2, Outcome.DONE)
-            assert bench.snapshots[-1].reason is not Reason.PAUSED
-        await bench.end()
-
-    run_virtual(go())
+    bench = Bench(settings(modbus=ModbusConfig(port=port, write=True)))
+    with closing(Plc(port)) as plc:
+        await asyncio.sleep(3.0)
+        await outside(lambda: plc.order(1, CommandCode.PAUSE, 0, 0, 0))
+        await asyncio.sleep(1.0)
+        assert await outside(plc.outcome) == (1, Outcome.DONE)
+        paused = [one for one in bench.snapshots if one.reason is Reason.PAUSED]
+        said = [one.state for one in paused if one.t_mono - paused[0].t_mono < 0.35]
+        assert len(said) >= 3
+        assert set(said) == {State.DEGRADED}, "it drives: without wheels it is LOST soon after"
+        await outside(lambda: plc.order(2, CommandCode.RESUME, 0, 0, 0))
+        await asyncio.sleep(1.0)
+        assert await outside(plc.outcome) == (2, Outcome.DONE)
+        assert bench.snapshots[-1].reason is not Reason.PAUSED
+    await bench.end()
 
 
 def test_who_subscribes_gets_poses_and_this_computer_always_may() -> None:

@@ -107,26 +107,22 @@ def test_the_lights_reader_knows_every_name_of_the_document() -> None:
     assert tuple(use.name for use in LinkUse) == read_lights.USES
 
 
-def test_odometry_sender() -> None:
+async def test_odometry_sender() -> None:
     odometry: list[RawOdometry] = []
     imu: list[RawImu] = []
-
-    async def run() -> None:
-        port = InputPort(SystemClock(), "127.0.0.1", 0)
-        tasks = [asyncio.create_task(port.odometry.run(odometry.append)), asyncio.create_task(port.imu.run(imu.append))]
-        await asyncio.sleep(0.01)
-        sender = send_odometry.Sender("127.0.0.1", port.port, shared_clock=True)
-        for number in range(5):
-            sender.odometry(float(number), -1.0, 0.5, time.monotonic() - 0.01)
-            sender.imu(0.25)
-        sender.close()
-        await asyncio.sleep(0.05)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        assert port.invalid == 0
-
-    asyncio.run(run())
+    port = InputPort(SystemClock(), "127.0.0.1", 0)
+    tasks = [asyncio.create_task(port.odometry.run(odometry.append)), asyncio.create_task(port.imu.run(imu.append))]
+    await asyncio.sleep(0.01)
+    sender = send_odometry.Sender("127.0.0.1", port.port, shared_clock=True)
+    for number in range(5):
+        sender.odometry(float(number), -1.0, 0.5, time.monotonic() - 0.01)
+        sender.imu(0.25)
+    sender.close()
+    await asyncio.sleep(0.05)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    assert port.invalid == 0
     assert [(o.x, o.y, o.yaw) for o in odometry] == [(float(n), -1.0, 0.5) for n in range(5)]
     assert all(o.t_rx - o.t_mono >= 0.009 for o in odometry), "the sender's time is used, not the arrival"
     assert [i.yaw_rate for i in imu] == [0.25] * 5
@@ -196,15 +192,12 @@ def test_commander(name: str) -> None:
     assert request.map_id == (0x1A2B3C4D if name == "switch_map" else 0)
 
 
-def test_commander_where_writing_is_not_allowed() -> None:
-    async def run() -> None:
-        async with publishing() as publisher:
-            commander = send_command.Commander("127.0.0.1", publisher.port)
-            with pytest.raises(ValueError, match=r"exception 2 \(set modbus\.write = true\)"):
-                await asyncio.to_thread(commander.order, "reset")
-            commander.close()
-
-    asyncio.run(run())
+async def test_commander_where_writing_is_not_allowed() -> None:
+    async with publishing() as publisher:
+        commander = send_command.Commander("127.0.0.1", publisher.port)
+        with pytest.raises(ValueError, match=r"exception 2 \(set modbus\.write = true\)"):
+            await asyncio.to_thread(commander.order, "reset")
+        commander.close()
 
 
 @pytest.mark.parametrize(

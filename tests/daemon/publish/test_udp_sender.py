@@ -96,7 +96,8 @@ def test_an_unknown_name_is_tried_again_and_said_once(
     assert "plc.local:9: host name not known" in caplog.text
 
 
-def test_a_look_up_that_fails_in_another_way_is_tried_again(
+@pytest.mark.virtual
+async def test_a_look_up_that_fails_in_another_way_is_tried_again(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     tries: list[float] = []
@@ -108,15 +109,11 @@ def test_a_look_up_that_fails_in_another_way_is_tried_again(
         return [(socket.AF_INET, ("127.0.0.1", port))]
 
     monkeypatch.setattr(inet, "resolve", resolve)
-
-    async def run() -> None:
-        sender = PoseSender(["plc.local:9"])
-        await sender.start()
-        await asyncio.sleep(1.5 * udp_sender.RETRY_S)
-        assert sender.receivers[0].address == (socket.AF_INET, ("127.0.0.1", 9))
-        await sender.close()
-
-    run_virtual(run())
+    sender = PoseSender(["plc.local:9"])
+    await sender.start()
+    await asyncio.sleep(1.5 * udp_sender.RETRY_S)
+    assert sender.receivers[0].address == (socket.AF_INET, ("127.0.0.1", 9))
+    await sender.close()
     assert "can't start new thread" in caplog.text
 
 
@@ -207,36 +204,28 @@ LOOPBACK = socket.if_nametoindex("lo")
 
 
 @pytest.mark.skipif(not socket.has_ipv6, reason="this computer has no IPv6")
-def test_a_group_of_a_named_network_interface_is_sent_to_by_that() -> None:
+async def test_a_group_of_a_named_network_interface_is_sent_to_by_that() -> None:
     """The loopback interface has no groups: it is asked for what the kernel would use."""
-
-    async def run() -> None:
-        sender = PoseSender(["[ff15::42%lo]:5000", f"[fe80::1%{LOOPBACK}]:5000", "[ff15::42]:5000"])
-        await sender.start()
-        addresses = [receiver.address for receiver in sender.receivers]
-        assert addresses == [
-            (socket.AF_INET6, ("ff15::42", 5000, 0, LOOPBACK)),
-            (socket.AF_INET6, ("fe80::1", 5000, 0, LOOPBACK)),
-            (socket.AF_INET6, ("ff15::42", 5000)),
-        ]
-        for interface in (LOOPBACK, 0):
-            with sender._open(socket.AF_INET6, interface) as sock:
-                assert sock.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF) == interface
-        await sender.close()
-
-    asyncio.run(run())
+    sender = PoseSender(["[ff15::42%lo]:5000", f"[fe80::1%{LOOPBACK}]:5000", "[ff15::42]:5000"])
+    await sender.start()
+    addresses = [receiver.address for receiver in sender.receivers]
+    assert addresses == [
+        (socket.AF_INET6, ("ff15::42", 5000, 0, LOOPBACK)),
+        (socket.AF_INET6, ("fe80::1", 5000, 0, LOOPBACK)),
+        (socket.AF_INET6, ("ff15::42", 5000)),
+    ]
+    for interface in (LOOPBACK, 0):
+        with sender._open(socket.AF_INET6, interface) as sock:
+            assert sock.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF) == interface
+    await sender.close()
 
 
-def test_an_interface_that_is_not_there_is_named_with_those_that_are(caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_interface_that_is_not_there_is_named_with_those_that_are(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-
-    async def run() -> None:
-        with pytest.raises(DeviceMissing, match=r"no network interface eth77 on this computer \(name one .*lo"):
-            await inet.resolve("ff15::42%eth77", 5000)
-        sender = PoseSender(["[ff15::42%eth77]:5000"])
-        await sender.start()
-        await asyncio.sleep(0.01)
-        await sender.close()
-
-    asyncio.run(run())
+    with pytest.raises(DeviceMissing, match=r"no network interface eth77 on this computer \(name one .*lo"):
+        await inet.resolve("ff15::42%eth77", 5000)
+    sender = PoseSender(["[ff15::42%eth77]:5000"])
+    await sender.start()
+    await asyncio.sleep(0.01)
+    await sender.close()
     assert "pose receiver [ff15::42%eth77]:5000: no network interface eth77" in caplog.text

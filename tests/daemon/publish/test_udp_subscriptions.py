@@ -142,82 +142,71 @@ class Client:
         return answer
 
 
-def test_a_subscriber_gets_what_receivers_get() -> None:
-    async def run() -> None:
-        server, client = Subscriptions("127.0.0.1", 0, lambda _: True), Client()
-        await server.start()
-        sender = PoseSender([], "", server)
-        await sender.start()
-        sender.publish(snapshot(seq=1))
-        assert (await client.subscribe(server.port, 30)).status is Status.GRANTED
-        for number in (2, 3):
-            sender.publish(snapshot(seq=number))
-            data = await client.get()
-            assert registers.decode_datagram(data)["seq"] == number
-        assert (await client.subscribe(server.port, 0)).status is Status.ENDED
-        sender.publish(snapshot(seq=4))
-        assert server.sent == 2 + 4
-        client.sock.sendto(b"rubbish", ("127.0.0.1", server.port))
-        await until(lambda: server.malformed == 1)
-        await sender.close()
-        await server.close()
-        server.send(b"nobody")
+async def test_a_subscriber_gets_what_receivers_get() -> None:
+    server, client = Subscriptions("127.0.0.1", 0, lambda _: True), Client()
+    await server.start()
+    sender = PoseSender([], "", server)
+    await sender.start()
+    sender.publish(snapshot(seq=1))
+    assert (await client.subscribe(server.port, 30)).status is Status.GRANTED
+    for number in (2, 3):
+        sender.publish(snapshot(seq=number))
+        data = await client.get()
+        assert registers.decode_datagram(data)["seq"] == number
+    assert (await client.subscribe(server.port, 0)).status is Status.ENDED
+    sender.publish(snapshot(seq=4))
+    assert server.sent == 2 + 4
+    client.sock.sendto(b"rubbish", ("127.0.0.1", server.port))
+    await until(lambda: server.malformed == 1)
+    await sender.close()
+    await server.close()
+    server.send(b"nobody")
+    client.sock.close()
+
+
+async def test_who_has_subscribed_at_one_of_many_addresses_gets_all_from_there() -> None:
+    server = Subscriptions("0.0.0.0", 0, lambda _: True)
+    await server.start()
+    clients = [(Client((host, server.port)), host) for host in ("127.0.0.1", "127.0.0.2")]
+    for client, host in clients:
+        assert (await client.subscribe(server.port, 30, host)).status is Status.GRANTED
+    server.send(b"pose")
+    for client, _ in clients:
+        assert await client.get() == b"pose"
         client.sock.close()
-
-    asyncio.run(run())
-
-
-def test_who_has_subscribed_at_one_of_many_addresses_gets_all_from_there() -> None:
-    async def run() -> None:
-        server = Subscriptions("0.0.0.0", 0, lambda _: True)
-        await server.start()
-        clients = [(Client((host, server.port)), host) for host in ("127.0.0.1", "127.0.0.2")]
-        for client, host in clients:
-            assert (await client.subscribe(server.port, 30, host)).status is Status.GRANTED
-        server.send(b"pose")
-        for client, _ in clients:
-            assert await client.get() == b"pose"
-            client.sock.close()
-        await server.close()
-
-    asyncio.run(run())
+    await server.close()
 
 
-def test_a_stranger_gets_no_answer_and_a_gone_network_is_counted() -> None:
+async def test_a_stranger_gets_no_answer_and_a_gone_network_is_counted() -> None:
     class Gone:
         def sendto(self, data: bytes, peer: object) -> int:
             raise OSError(101, "Network is unreachable")
 
-    async def run() -> None:
-        asked: list[str] = []
-        server, client = Subscriptions("127.0.0.1", 0, lambda host: bool(asked.append(host))), Client()
-        await server.start()
-        client.sock.sendto(encode(Message(Status.ASK, 10, 0)), ("127.0.0.1", server.port))
-        await until(lambda: bool(asked))
-        assert (server.sent, server.malformed, len(server.leases)) == (0, 0, 0)
-        subscribe(server.leases, asyncio.get_running_loop().time(), peer=(PEER, ()))
-        real, server._sock = server._sock, Gone()  # type: ignore[assignment]  # all that is asked of a socket
+    asked: list[str] = []
+    server, client = Subscriptions("127.0.0.1", 0, lambda host: bool(asked.append(host))), Client()
+    await server.start()
+    client.sock.sendto(encode(Message(Status.ASK, 10, 0)), ("127.0.0.1", server.port))
+    await until(lambda: bool(asked))
+    assert (server.sent, server.malformed, len(server.leases)) == (0, 0, 0)
+    subscribe(server.leases, asyncio.get_running_loop().time(), peer=(PEER, ()))
+    real, server._sock = server._sock, Gone()  # type: ignore[assignment]  # all that is asked of a socket
+    server.send(b"data")
+    assert server.dropped == 1
+    server._sock = real
+    await server.close()
+    client.sock.close()
+
+
+@pytest.mark.virtual
+async def test_a_lease_runs_out_without_a_word() -> None:
+    server = Subscriptions("127.0.0.1", 0, lambda _: True)
+    await server.start()
+    subscribe(server.leases, asyncio.get_running_loop().time(), lease=5, peer=(("127.0.0.1", 9), ()))
+    for _ in range(60):
         server.send(b"data")
-        assert server.dropped == 1
-        server._sock = real
-        await server.close()
-        client.sock.close()
-
-    asyncio.run(run())
-
-
-def test_a_lease_runs_out_without_a_word() -> None:
-    async def run() -> None:
-        server = Subscriptions("127.0.0.1", 0, lambda _: True)
-        await server.start()
-        subscribe(server.leases, asyncio.get_running_loop().time(), lease=5, peer=(("127.0.0.1", 9), ()))
-        for _ in range(60):
-            server.send(b"data")
-            await asyncio.sleep(0.1)
-        assert server.sent + server.dropped in (50, 51)
-        await server.close()
-
-    run_virtual(run())
+        await asyncio.sleep(0.1)
+    assert server.sent + server.dropped in (50, 51)
+    await server.close()
 
 
 def test_a_port_that_cannot_be_had_names_the_key() -> None:

@@ -232,34 +232,31 @@ def test_the_header_says_what_was_recorded_with_what(tmp_path: Path) -> None:
     assert header["segment"] == 0
 
 
-def test_everything_through_a_port_is_kept_in_order(tmp_path: Path) -> None:
-    async def main() -> None:
-        clock = SystemClock()
-        recorder = Recorder(tmp_path, Config(), clock)
-        ours, theirs = memory_pair(clock, "/dev/x")
+async def test_everything_through_a_port_is_kept_in_order(tmp_path: Path) -> None:
+    clock = SystemClock()
+    recorder = Recorder(tmp_path, Config(), clock)
+    ours, theirs = memory_pair(clock, "/dev/x")
 
-        async def opener(device: str, baud: int) -> Port:
-            assert (device, baud) == ("/dev/x", 19200)
-            return theirs
+    async def opener(device: str, baud: int) -> Port:
+        assert (device, baud) == ("/dev/x", 19200)
+        return theirs
 
-        port = await recorder.tap(opener)("/dev/x", 19200)
-        got: list[bytes] = []
-        lost: list[HalError] = []
-        ours.start(lambda data, t_rx: ours.write(b"reply to " + data), lambda error: None)
-        port.start(lambda data, t_rx: got.append(data), lost.append)
-        port.write(b"VV\n")
-        await asyncio.sleep(0.01)
-        port.set_baud(115200)
-        ours.close()
-        await asyncio.sleep(0.01)
-        assert got == [b"reply to VV\n"]
-        assert len(lost) == 1
-        assert isinstance(lost[0], DeviceMissing)
-        port.close()
-        assert port.name == "/dev/x"
-        recorder.close()
-
-    asyncio.run(main())
+    port = await recorder.tap(opener)("/dev/x", 19200)
+    got: list[bytes] = []
+    lost: list[HalError] = []
+    ours.start(lambda data, t_rx: ours.write(b"reply to " + data), lambda error: None)
+    port.start(lambda data, t_rx: got.append(data), lost.append)
+    port.write(b"VV\n")
+    await asyncio.sleep(0.01)
+    port.set_baud(115200)
+    ours.close()
+    await asyncio.sleep(0.01)
+    assert got == [b"reply to VV\n"]
+    assert len(lost) == 1
+    assert isinstance(lost[0], DeviceMissing)
+    port.close()
+    assert port.name == "/dev/x"
+    recorder.close()
     frames, _ = read(tmp_path)
     assert [(Kind(frame.kind).name, frame.payload) for frame in frames] == [
         ("OPEN", b"/dev/x 19200"),

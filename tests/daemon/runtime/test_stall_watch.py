@@ -71,13 +71,10 @@ def test_in_time_nothing_is_said_and_after_it_only_one_line_in_a_while(watch: St
     assert "more" not in watch.said
 
 
-def test_the_loop_at_rest_is_not_blamed(watch: StallWatch) -> None:
-    async def go() -> None:
-        watch.arm(0.05)
-        await asyncio.sleep(0.3)
-        watch.arm(10.0)
-
-    asyncio.run(go())
+async def test_the_loop_at_rest_is_not_blamed(watch: StallWatch) -> None:
+    watch.arm(0.05)
+    await asyncio.sleep(0.3)
+    watch.arm(10.0)
     assert "no cycle began" in watch.said
     assert "burn" not in watch.said
 

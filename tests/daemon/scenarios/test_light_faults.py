@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pytest
 
 from daemon.health.faults import FAULTS, Fault
-from daemon.snapshot import State
+from daemon.snapshot import LightPicture, State
 from estimator.cdma.air_interface import PROFILE_A
 from hal.fake.adc.faults import ERRORS
 from hal.fake.lidar.models import URG_04LX_UG01
@@ -119,6 +119,8 @@ def test_a_converter_that_falls_silent_is_shown_within_five_blocks(order: str, l
         shown = await bench.until(lambda snapshot: snapshot.adc_ok is False, 2.0)
         cycle = 1.5 * (URG_04LX_UG01.true_period_s if lidar else PROFILE_A.epoch_s)
         assert shown.t_sent - begun <= 5.0 * PROFILE_A.epoch_s + cycle
+        assert shown.light == LightPicture(blocks=shown.light.blocks, blocks_lost=shown.light.blocks_lost)
+        assert (shown.links, shown.light_id) == (0, None), "no link of before is shown"
 
     run_daemon(scenario, lidar=lidar)
 

@@ -20,7 +20,7 @@ from daemon.devices.light_setup import Lights, load_lights
 from daemon.devices.photodiode import BlockWatch
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.worker import CycleWorker
-from daemon.snapshot import LightPicture, Snapshot
+from daemon.snapshot import Snapshot
 from estimator.cdma.air_interface import PROFILE_A, PROFILE_B
 from hal.adc import AdcStatus
 from hal.clock import LoopClock, run_virtual
@@ -162,22 +162,6 @@ def test_without_a_photodiode_nothing_is_said_of_one() -> None:
         assert bench.buses.opened == 0
 
     run_daemon(scenario, lidar=True, light=False)
-
-
-@pytest.mark.parametrize("lidar", [False, True])
-def test_a_converter_that_falls_silent_is_shown_within_five_blocks(lidar: bool) -> None:
-    async def scenario(bench: Bench) -> None:
-        await bench.until(decoded, 6.0)
-        t_last = bench.loop.time()
-        bench.order("what = 'gone'")
-        gone = await bench.until(lambda snapshot: snapshot.adc_ok is False, 2.0)
-        assert gone.light == LightPicture(blocks=gone.light.blocks, blocks_lost=gone.light.blocks_lost)
-        assert (gone.links, gone.light_id) == (0, None), "what was seen before is not seen now"
-        assert gone.t_sent - t_last <= (5.0 if not lidar else 7.0) * BLOCK_S  # a URG's scans are two blocks apart
-        bench.faults.clear()
-        await bench.until(lambda snapshot: bool(snapshot.adc_ok) and decoded(snapshot), 10.0)
-
-    run_daemon(scenario, lidar=lidar)
 
 
 def test_blocks_of_a_millisecond_may_come_late_together() -> None:

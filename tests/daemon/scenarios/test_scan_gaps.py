@@ -7,6 +7,7 @@ import itertools
 
 import pytest
 
+from daemon.health.reasons import Reason
 from daemon.integrity.evidence import SILENT_PERIODS
 from daemon.snapshot import State
 from hal.fake.lidar.scan_world import Room
@@ -58,6 +59,7 @@ def test_a_gap_is_shown_at_once_and_over_at_once(gap: str, wheels: bool) -> None
         bench.faults.load(f"[[fault]]\n{GAPS[gap]}")
         gone = await bench.until(State.NO_LIDAR, 2.0)
         assert gone.t_sent - t_fault <= (SILENT_PERIODS + 1.1) * PERIOD
+        assert gap != "silence" or gone.reason == Reason.LIDAR_SILENT
         tracked = await bench.until(State.TRACKING, 30.0)
         back = next(s for s in reversed(bench.snapshots) if s.lidar_ok is False)  # a cycle later a scan was there
         assert tracked.t_sent - back.t_sent <= TRACKING_S + PERIOD

@@ -83,35 +83,6 @@ def test_what_a_row_alone_has_told_is_no_knowledge_from_before_it() -> None:
         assert told.least(0.0) == pytest.approx((0.02**2, 0.01**2))
 
 
-def test_one_lamp_or_none_in_use_says_nothing_of_a_row() -> None:
-    known = catalogue([(0.0, 0.0), (3.0, 0.0)])
-    assert [collinear_lamps.several(known, frozenset(lamps)) for lamps in ({1, 2}, {1}, {1, 17}, set())] == [
-        True,
-        False,
-        False,
-        False,
-    ]
-
-
-def test_two_rows_one_lamp_or_none_change_nothing() -> None:
-    known = catalogue([(0.0, 0.0), (3.0, 0.0), (0.0, 2.5), (3.0, 2.5)])
-    for lamps in ({1, 2, 3, 4}, {1}, set(), {17}):
-        P = np.diag((0.02**2, 0.02**2, 0.01**2))
-        collinear_lamps.loosen(*collinear_lamps.shape(known, frozenset(lamps)), P)
-        assert np.sqrt(np.diag(P)) == pytest.approx((0.02, 0.02, 0.01), abs=2e-4)
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.4, 1.5])
-def test_of_a_pose_that_is_off_only_what_is_beyond_doubt_counts(angle: float) -> None:
-    """Along the row to 0.1 m, across it to 1 m, the heading to 0.25 rad."""
-    c, s = math.cos(angle), math.sin(angle)
-    R = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
-    P = R @ np.diag((0.1**2, 1.0, 0.25**2)) @ R.T
-    assert collinear_lamps.sure_part(R @ np.array((0.6, 1.4, 0.7)), P) == pytest.approx((0.6, 0.0))
-    assert collinear_lamps.sure_part(R @ np.array((0.2, 4.0, -0.8)), P) == pytest.approx((4.0, 0.8))
-    assert collinear_lamps.sure_part(R @ np.array((3.0, -4.0, 0.0)), P) == pytest.approx((5.0, 0.0))
-
-
 def test_what_a_row_has_led_astray_stays_in_doubt_for_a_while_with_other_lamps() -> None:
     """Ten metres of a row, then a lamp beside it: doubted as before at first, as those lamps alone after a metre."""
     known = catalogue([(3.0 * k, 0.0) for k in range(4)] + [(1.5, 4.0)])
@@ -128,16 +99,6 @@ def test_what_a_row_has_led_astray_stays_in_doubt_for_a_while_with_other_lamps()
     assert lately.left.trace() < 0.01 * a_row.trace()
 
 
-@pytest.mark.parametrize(("beside_m", "least", "most"), [(0.1, 0.95, 1.0), (2.0, 0.3, 0.7), (6.0, 0.0, 0.01)])
-def test_how_much_of_a_row_lamps_are(beside_m: float, least: float, most: float) -> None:
-    """Four in a line, and two beside it: by what the six are off a line together."""
-    known = catalogue([(3.0 * k, 0.0) for k in range(4)] + [(1.5, beside_m), (4.5, beside_m)])
-    lately = collinear_lamps.Lately()
-    assert lately.narrow(1.0) == 0.0
-    lately.take(collinear_lamps.doubt(known, frozenset(range(1, 7))), 0.0)
-    assert least <= lately.narrow(1.0) <= most
-
-
 def test_what_a_row_has_led_astray_is_not_forgotten_in_the_dark() -> None:
     """The first lamp beside it after a metre without any is the first all the same; so is a start below a row."""
     known = catalogue([(3.0 * k, 0.0) for k in range(4)] + [(1.5, 4.0)])
@@ -147,22 +108,6 @@ def test_what_a_row_has_led_astray_is_not_forgotten_in_the_dark() -> None:
         lately.take(a_row, begun)
         lately.take(beside, way)
         assert lately.left.trace() > 0.5 * a_row.trace()
-
-
-def test_a_row_for_a_moment_leaves_nothing() -> None:
-    """Lamps hidden behind somebody: as doubtful as a row while they are, and not after."""
-    known = catalogue([(3.0 * k, 0.0) for k in range(4)] + [(1.5, 4.0)])
-    a_row, all_of_them = (
-        collinear_lamps.doubt(known, frozenset({1, 2, 3, 4})),
-        collinear_lamps.doubt(known, frozenset({1, 2, 5})),
-    )
-    lately = collinear_lamps.Lately()
-    for way in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5):
-        lately.take(all_of_them, way)
-    lately.take(a_row, 0.51)
-    assert lately.left == pytest.approx(a_row)
-    lately.take(all_of_them, 0.52)
-    assert lately.left.trace() < 0.1 * a_row.trace()
 
 
 @pytest.mark.jit

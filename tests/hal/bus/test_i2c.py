@@ -121,12 +121,10 @@ def test_an_unplugged_adapter_stays_dead_for_whoever_had_it_open() -> None:
     on_memory(body)
 
 
-def test_an_opener_says_what_is_plugged_in() -> None:
-    async def main() -> None:
-        clock = LoopClock(asyncio.get_running_loop())
-        buses = FakeBuses(clock)
-        buses.plug("/dev/i2c-1", FakeAdc(lambda t: t, clock))
-        with pytest.raises(DeviceMissing, match=r"no such bus .plugged in: /dev/i2c-1"):
-            await buses("/dev/i2c-2")
-
-    run_virtual(main())
+@pytest.mark.virtual
+async def test_an_opener_says_what_is_plugged_in() -> None:
+    clock = LoopClock(asyncio.get_running_loop())
+    buses = FakeBuses(clock)
+    buses.plug("/dev/i2c-1", FakeAdc(lambda t: t, clock))
+    with pytest.raises(DeviceMissing, match=r"no such bus .plugged in: /dev/i2c-1"):
+        await buses("/dev/i2c-2")

@@ -127,29 +127,25 @@ def test_an_address_belongs_to_who_spoke_to_it_first(monkeypatch: pytest.MonkeyP
     assert linux.closed == 1
 
 
-def test_a_bus_that_was_closed_while_a_transaction_hangs_has_no_address(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_bus_that_was_closed_while_a_transaction_hangs_has_no_address(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its driver opens it anew meanwhile: what hangs is to be named as that, not as another program."""
     linux = kernel(monkeypatch)
-
-    async def main() -> None:
-        bus = await open_bus("/dev/i2c-1")
-        await bus.transfer((read(0x4D, 2),))
-        linux.hang = True
-        hanging = asyncio.create_task(bus.transfer((read(0x4D, 2),)))
-        await asyncio.sleep(0.05)
-        await bus.close()
-        again = await open_bus("/dev/i2c-1")
-        waiting = asyncio.create_task(again.transfer((read(0x4D, 2),)))
-        done, _ = await asyncio.wait({waiting}, timeout=0.1)
-        assert not done, await waiting
-        linux.hang = False
-        await asyncio.gather(hanging, waiting)
-        await again.transfer((read(0x4D, 2),))  # the end of the first one has not taken its address away
-        with pytest.raises(OSError, match="in use by another program"):
-            open_linux("/dev/i2c-1").transfer((read(0x4D, 2),))
-        await again.close()
-
-    asyncio.run(main())
+    bus = await open_bus("/dev/i2c-1")
+    await bus.transfer((read(0x4D, 2),))
+    linux.hang = True
+    hanging = asyncio.create_task(bus.transfer((read(0x4D, 2),)))
+    await asyncio.sleep(0.05)
+    await bus.close()
+    again = await open_bus("/dev/i2c-1")
+    waiting = asyncio.create_task(again.transfer((read(0x4D, 2),)))
+    done, _ = await asyncio.wait({waiting}, timeout=0.1)
+    assert not done, await waiting
+    linux.hang = False
+    await asyncio.gather(hanging, waiting)
+    await again.transfer((read(0x4D, 2),))  # the end of the first one has not taken its address away
+    with pytest.raises(OSError, match="in use by another program"):
+        open_linux("/dev/i2c-1").transfer((read(0x4D, 2),))
+    await again.close()
 
 
 def test_a_closed_bus(monkeypatch: pytest.MonkeyPatch) -> None:

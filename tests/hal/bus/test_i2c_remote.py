@@ -27,118 +27,102 @@ from tests.hal.photodiode.bench import Bench, Light, falsehoods
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_transactions(kind: str, tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served(kind, tmp_path) as (where, fake, _):
-            bus = await open_bus(where)
-            assert bus.name == where
-            assert bus.about == fake.bus.adapter.name
-            before = time.monotonic()
-            done = await bus.transfer((read(0x4D, 900),))
-            assert before <= done.t0 < done.t1 <= time.monotonic()
-            assert done.t1 - done.t0 == pytest.approx(8110 / 400e3, abs=1e-3)
-            words = [int.from_bytes(done.reads[0][k : k + 2], "big") for k in range(0, 900, 2)]
-            expected = [int(4096 * ((t * 5.0) % 1.0)) for t in (done.t0, done.t1)]
-            assert abs(words[0] - expected[0]) % 4090 < 8
-            assert abs(words[-1] - expected[1]) % 4090 < 8
-            await bus.close()
-
-    asyncio.run(main())
+async def test_transactions(kind: str, tmp_path: Path) -> None:
+    async with served(kind, tmp_path) as (where, fake, _):
+        bus = await open_bus(where)
+        assert bus.name == where
+        assert bus.about == fake.bus.adapter.name
+        before = time.monotonic()
+        done = await bus.transfer((read(0x4D, 900),))
+        assert before <= done.t0 < done.t1 <= time.monotonic()
+        assert done.t1 - done.t0 == pytest.approx(8110 / 400e3, abs=1e-3)
+        words = [int.from_bytes(done.reads[0][k : k + 2], "big") for k in range(0, 900, 2)]
+        expected = [int(4096 * ((t * 5.0) % 1.0)) for t in (done.t0, done.t1)]
+        assert abs(words[0] - expected[0]) % 4090 < 8
+        assert abs(words[-1] - expected[1]) % 4090 < 8
+        await bus.close()
 
 
-def test_errors_come_through_with_their_errno(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, _, schedule):
-            bus = await open_bus(where)
-            for name in ("EIO", "EREMOTEIO", "EAGAIN", "EOPNOTSUPP", "ENXIO"):
-                schedule.load(f"[[fault]]\nwhat = 'error'\nname = '{name}'\non = 'all'")
-                await asyncio.sleep(0.01)
-                with pytest.raises(OSError, match=os.strerror(getattr(errno, name))) as caught:
-                    await bus.transfer((read(0x4D, 2),))
-                assert caught.value.errno == getattr(errno, name)
-                schedule.clear()
-            with pytest.raises(OSError, match="Remote I/O") as caught:
-                await bus.transfer((write(0x4D, b"\x01"),))
-            assert len((await bus.transfer((read(0x4D, 2),))).reads[0]) == 2
-            with pytest.raises(OSError, match="8193 bytes"):
-                await bus.transfer((read(0x4D, 8193),))
-            await bus.close()
-
-    asyncio.run(main())
+async def test_errors_come_through_with_their_errno(tmp_path: Path) -> None:
+    async with served("unix", tmp_path) as (where, _, schedule):
+        bus = await open_bus(where)
+        for name in ("EIO", "EREMOTEIO", "EAGAIN", "EOPNOTSUPP", "ENXIO"):
+            schedule.load(f"[[fault]]\nwhat = 'error'\nname = '{name}'\non = 'all'")
+            await asyncio.sleep(0.01)
+            with pytest.raises(OSError, match=os.strerror(getattr(errno, name))) as caught:
+                await bus.transfer((read(0x4D, 2),))
+            assert caught.value.errno == getattr(errno, name)
+            schedule.clear()
+        with pytest.raises(OSError, match="Remote I/O") as caught:
+            await bus.transfer((write(0x4D, b"\x01"),))
+        assert len((await bus.transfer((read(0x4D, 2),))).reads[0]) == 2
+        with pytest.raises(OSError, match="8193 bytes"):
+            await bus.transfer((read(0x4D, 8193),))
+        await bus.close()
 
 
 @pytest.mark.realtime
 @pytest.mark.system  # the pauses are few milliseconds: it has the machine to itself
 @pytest.mark.parametrize("kind", KINDS)
-def test_blocks_follow_each_other_without_waiting_for_the_client(kind: str, tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served(kind, tmp_path) as (where, _, _schedule):
-            bus = await open_bus(where)
-            got: list[tuple[float, float]] = []
-            task = asyncio.create_task(bus.stream((read(0x4D, 2222),), lambda done, _: got.append((done.t0, done.t1))))
-            await asyncio.sleep(1.5)
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-            await bus.close()
-            assert len(got) > 7
-            assert sorted(got) == got
-            pauses = sorted(late[0] - early[1] for early, late in pairwise(got))
-            assert pauses[len(pauses) // 2] < 4 * 2e-3
-
-    asyncio.run(main())
+async def test_blocks_follow_each_other_without_waiting_for_the_client(kind: str, tmp_path: Path) -> None:
+    async with served(kind, tmp_path) as (where, _, _schedule):
+        bus = await open_bus(where)
+        got: list[tuple[float, float]] = []
+        task = asyncio.create_task(bus.stream((read(0x4D, 2222),), lambda done, _: got.append((done.t0, done.t1))))
+        await asyncio.sleep(1.5)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        await bus.close()
+        assert len(got) > 7
+        assert sorted(got) == got
+        pauses = sorted(late[0] - early[1] for early, late in pairwise(got))
+        assert pauses[len(pauses) // 2] < 4 * 2e-3
 
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_driver_over_a_socket(kind: str, tmp_path: Path) -> None:
+async def test_the_driver_over_a_socket(kind: str, tmp_path: Path) -> None:
     """The whole chain in real time: the words are the light's, at the times it had them."""
-
-    async def main() -> None:
-        light = Light()
-        async with served(kind, tmp_path, light) as (where, _, _schedule):
-            clock = SystemClock()
-            blocks: list[RawSamples] = []
-            driver = PhotodiodeAdc(where, 0x4D, "MCP3221", clock=clock, opener=open_bus)
-            task = asyncio.create_task(driver.run(blocks.append))
-            end = clock.now() + 4 * 3.0
-            while len(blocks) < 20:
-                assert clock.now() < end, driver.status
-                await asyncio.sleep(0.01)
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-            assert falsehoods(Bench(clock, open_bus, light=light), blocks, rate_error=0.05) == []
-            assert driver.status.error is None
-
-    asyncio.run(main())
+    light = Light()
+    async with served(kind, tmp_path, light) as (where, _, _schedule):
+        clock = SystemClock()
+        blocks: list[RawSamples] = []
+        driver = PhotodiodeAdc(where, 0x4D, "MCP3221", clock=clock, opener=open_bus)
+        task = asyncio.create_task(driver.run(blocks.append))
+        end = clock.now() + 4 * 3.0
+        while len(blocks) < 20:
+            assert clock.now() < end, driver.status
+            await asyncio.sleep(0.01)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        assert falsehoods(Bench(clock, open_bus, light=light), blocks, rate_error=0.05) == []
+        assert driver.status.error is None
 
 
 @pytest.mark.realtime
 @pytest.mark.system
-def test_the_driver_survives_its_server(tmp_path: Path) -> None:
-    async def main() -> None:
-        clock = SystemClock()
-        blocks: list[RawSamples] = []
-        where = f"unix:{tmp_path}/i2c"
-        driver = PhotodiodeAdc(where, 0x4D, "MCP3221", clock=clock, opener=open_bus)
-        task = asyncio.create_task(driver.run(blocks.append))
-        await asyncio.sleep(0.1)
-        assert isinstance(driver.status.error, DeviceMissing)
-        for _ in range(2):
-            seen = len(blocks)
-            async with served("unix", tmp_path):
-                end = clock.now() + 4 * 3.0
-                while len(blocks) < seen + 3:
-                    assert clock.now() < end, driver.status
-                    await asyncio.sleep(0.01)
-                assert driver.status.error is None
-            await asyncio.sleep(0.3)
-            assert "bus server has closed the connection" in str(driver.status.error)
-        await asyncio.sleep(2.0)
-        assert "start the bus server" in str(driver.status.error)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-
-    asyncio.run(main())
+async def test_the_driver_survives_its_server(tmp_path: Path) -> None:
+    clock = SystemClock()
+    blocks: list[RawSamples] = []
+    where = f"unix:{tmp_path}/i2c"
+    driver = PhotodiodeAdc(where, 0x4D, "MCP3221", clock=clock, opener=open_bus)
+    task = asyncio.create_task(driver.run(blocks.append))
+    await asyncio.sleep(0.1)
+    assert isinstance(driver.status.error, DeviceMissing)
+    for _ in range(2):
+        seen = len(blocks)
+        async with served("unix", tmp_path):
+            end = clock.now() + 4 * 3.0
+            while len(blocks) < seen + 3:
+                assert clock.now() < end, driver.status
+                await asyncio.sleep(0.01)
+            assert driver.status.error is None
+        await asyncio.sleep(0.3)
+        assert "bus server has closed the connection" in str(driver.status.error)
+    await asyncio.sleep(2.0)
+    assert "start the bus server" in str(driver.status.error)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
 
 
 # the client against servers that misbehave
@@ -200,7 +184,7 @@ def test_a_server_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.Monke
     server.join()
 
 
-def test_a_bus_that_is_closed_while_nothing_is_answered_hangs_up(tmp_path: Path) -> None:
+async def test_a_bus_that_is_closed_while_nothing_is_answered_hangs_up(tmp_path: Path) -> None:
     """What the server has open for it, an address above all, is free for the next connection."""
     hung_up = threading.Event()
 
@@ -210,18 +194,15 @@ def test_a_bus_that_is_closed_while_nothing_is_answered_hangs_up(tmp_path: Path)
             pass
         hung_up.set()
 
-    async def main() -> None:
-        server = Server(tmp_path / "s", behave)
-        bus = await open_bus(f"unix:{tmp_path}/s")
-        waiting = asyncio.create_task(bus.transfer((read(0x4D, 2),)))
-        await asyncio.sleep(0.05)
-        await bus.close()
-        assert await asyncio.to_thread(hung_up.wait, 1.0)
-        with pytest.raises(OSError, match="bus server"):
-            await waiting
-        server.join()
-
-    asyncio.run(main())
+    server = Server(tmp_path / "s", behave)
+    bus = await open_bus(f"unix:{tmp_path}/s")
+    waiting = asyncio.create_task(bus.transfer((read(0x4D, 2),)))
+    await asyncio.sleep(0.05)
+    await bus.close()
+    assert await asyncio.to_thread(hung_up.wait, 1.0)
+    with pytest.raises(OSError, match="bus server"):
+        await waiting
+    server.join()
 
 
 def test_times_of_another_computer_are_translated(tmp_path: Path) -> None:

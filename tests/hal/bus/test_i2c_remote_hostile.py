@@ -70,7 +70,7 @@ def test_fewer_bytes_are_no_lie(tmp_path: Path) -> None:
     server.join()
 
 
-def test_the_driver_survives_any_server(tmp_path: Path) -> None:
+async def test_the_driver_survives_any_server(tmp_path: Path) -> None:
     """Answers at random, for as long as it asks; then a true one at the same address."""
     path = tmp_path / "i2c"
 
@@ -88,19 +88,16 @@ def test_the_driver_survives_any_server(tmp_path: Path) -> None:
                     reads = tuple(chance.randbytes(n) for n in lengths[: chance.choice((1, 1, 1, 0))])
                     writer.write(frames.done(frames.Done(number, code, now, now, now + 1e-3, now + 1e-3, reads)))
 
-    async def main() -> None:
-        liar = await asyncio.start_unix_server(lying, str(path))
-        driver = PhotodiodeAdc(f"unix:{path}", 0x4D, "MCP3221", clock=SystemClock(), opener=open_bus)
-        running = asyncio.create_task(driver.run(lambda block: None))
-        await asyncio.sleep(1.5)
-        assert not running.done()
-        assert driver.status.error is not None
-        assert driver.status.error.remedy
-        liar.close()
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-
-    asyncio.run(main())
+    liar = await asyncio.start_unix_server(lying, str(path))
+    driver = PhotodiodeAdc(f"unix:{path}", 0x4D, "MCP3221", clock=SystemClock(), opener=open_bus)
+    running = asyncio.create_task(driver.run(lambda block: None))
+    await asyncio.sleep(1.5)
+    assert not running.done()
+    assert driver.status.error is not None
+    assert driver.status.error.remedy
+    liar.close()
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
 
 
 def test_a_step_of_the_other_clock_is_followed() -> None:
@@ -123,23 +120,17 @@ def test_nobody_is_served_from_outside_without_being_asked(where: str) -> None:
         asyncio.run(server().listen(where))
 
 
-def test_anyone_is_served_where_that_was_said() -> None:
-    async def main() -> None:
-        open_to_all = BusServer(FakeBuses(SystemClock()), "x", SystemClock(), anyone=True)
-        assert (await open_to_all.listen("tcp://0.0.0.0:0")).startswith("tcp://0.0.0.0:")
-        await open_to_all.close()
-
-    asyncio.run(main())
+async def test_anyone_is_served_where_that_was_said() -> None:
+    open_to_all = BusServer(FakeBuses(SystemClock()), "x", SystemClock(), anyone=True)
+    assert (await open_to_all.listen("tcp://0.0.0.0:0")).startswith("tcp://0.0.0.0:")
+    await open_to_all.close()
 
 
 @pytest.mark.parametrize("where", ["tcp://127.0.0.1:0", "tcp://localhost:0"])
-def test_this_computer_is_served(where: str) -> None:
-    async def main() -> None:
-        one = server()
-        assert "tcp://" in await one.listen(where)
-        await one.close()
-
-    asyncio.run(main())
+async def test_this_computer_is_served(where: str) -> None:
+    one = server()
+    assert "tcp://" in await one.listen(where)
+    await one.close()
 
 
 def test_an_unknown_host() -> None:
@@ -147,41 +138,32 @@ def test_an_unknown_host() -> None:
         asyncio.run(server().listen("tcp://no-such-host.invalid:0"))
 
 
-def test_a_unix_socket_is_its_owners(tmp_path: Path) -> None:
-    async def main() -> None:
-        one, other = server(), server()
-        await one.listen(f"unix:{tmp_path}/s")
-        assert stat.S_IMODE((tmp_path / "s").stat().st_mode) == 0o600
-        with pytest.raises(DeviceRefused, match="another server listens there"):
-            await other.listen(f"unix:{tmp_path}/s")
-        await other.close()
-        assert (tmp_path / "s").exists()  # what it did not make it does not remove
-        await one.close()
-
-    asyncio.run(main())
+async def test_a_unix_socket_is_its_owners(tmp_path: Path) -> None:
+    one, other = server(), server()
+    await one.listen(f"unix:{tmp_path}/s")
+    assert stat.S_IMODE((tmp_path / "s").stat().st_mode) == 0o600
+    with pytest.raises(DeviceRefused, match="another server listens there"):
+        await other.listen(f"unix:{tmp_path}/s")
+    await other.close()
+    assert (tmp_path / "s").exists()  # what it did not make it does not remove
+    await one.close()
 
 
-def test_clients_without_end(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, _, _schedule):
-            buses = [await open_bus(where) for _ in range(CLIENTS)]
-            with pytest.raises(DeviceRefused, match=f"{CLIENTS} clients already"):
-                await open_bus(where)
-            for bus in buses:
-                await bus.close()
-            await asyncio.sleep(0.1)
-            again = await open_bus(where)
-            await again.close()
-
-    asyncio.run(main())
+async def test_clients_without_end(tmp_path: Path) -> None:
+    async with served("unix", tmp_path) as (where, _, _schedule):
+        buses = [await open_bus(where) for _ in range(CLIENTS)]
+        with pytest.raises(DeviceRefused, match=f"{CLIENTS} clients already"):
+            await open_bus(where)
+        for bus in buses:
+            await bus.close()
+        await asyncio.sleep(0.1)
+        again = await open_bus(where)
+        await again.close()
 
 
-def test_a_bus_behind_the_server_that_is_missing(tmp_path: Path) -> None:
-    async def main() -> None:
-        one = server()
-        await one.listen(f"unix:{tmp_path}/s")
-        with pytest.raises(DeviceMissing, match=f"unix:{tmp_path}/s: no such bus"):
-            await open_bus(f"unix:{tmp_path}/s")
-        await one.close()
-
-    asyncio.run(main())
+async def test_a_bus_behind_the_server_that_is_missing(tmp_path: Path) -> None:
+    one = server()
+    await one.listen(f"unix:{tmp_path}/s")
+    with pytest.raises(DeviceMissing, match=f"unix:{tmp_path}/s: no such bus"):
+        await open_bus(f"unix:{tmp_path}/s")
+    await one.close()

@@ -20,33 +20,27 @@ from hal.fake.adc.converter import FakeBuses
 from tests.hal.bus.remote_bus import served
 
 
-def test_two_clients_take_turns(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, _, _schedule):
-            one, two = await open_bus(where), await open_bus(where)
-            done = await asyncio.gather(*(bus.transfer((read(0x4D, 400),)) for bus in (one, two, one, two)))
-            spans = sorted((d.t1 - d.t0) for d in done)
-            assert spans[-1] > 1.5 * spans[0]  # two of them had to wait for another one's
-            await one.close()
-            await two.close()
-
-    asyncio.run(main())
+async def test_two_clients_take_turns(tmp_path: Path) -> None:
+    async with served("unix", tmp_path) as (where, _, _schedule):
+        one, two = await open_bus(where), await open_bus(where)
+        done = await asyncio.gather(*(bus.transfer((read(0x4D, 400),)) for bus in (one, two, one, two)))
+        spans = sorted((d.t1 - d.t0) for d in done)
+        assert spans[-1] > 1.5 * spans[0]  # two of them had to wait for another one's
+        await one.close()
+        await two.close()
 
 
-def test_what_the_server_cannot_open_is_said_to_the_client(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, _, schedule):
-            for fault, kind, says in (
-                ("what = 'gone'", DeviceMissing, "no such bus"),
-                ("what = 'refuse'", DeviceRefused, "permission denied .*group i2c"),
-            ):
-                schedule.load(f"[[fault]]\n{fault}")
-                await asyncio.sleep(0.01)
-                with pytest.raises(kind, match=f"{where}: {says}"):
-                    await open_bus(where)
-                schedule.clear()
-
-    asyncio.run(main())
+async def test_what_the_server_cannot_open_is_said_to_the_client(tmp_path: Path) -> None:
+    async with served("unix", tmp_path) as (where, _, schedule):
+        for fault, kind, says in (
+            ("what = 'gone'", DeviceMissing, "no such bus"),
+            ("what = 'refuse'", DeviceRefused, "permission denied .*group i2c"),
+        ):
+            schedule.load(f"[[fault]]\n{fault}")
+            await asyncio.sleep(0.01)
+            with pytest.raises(kind, match=f"{where}: {says}"):
+                await open_bus(where)
+            schedule.clear()
 
 
 @pytest.mark.parametrize(
@@ -59,51 +53,42 @@ def test_what_the_server_cannot_open_is_said_to_the_client(tmp_path: Path) -> No
         b"\xff" * 100,
     ],
 )
-def test_a_client_that_speaks_something_else_is_hung_up_on(garbage: bytes, tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, _, _schedule):
-            reader, writer = await asyncio.open_unix_connection(where.removeprefix("unix:"))
-            writer.write(garbage)
-            data = await asyncio.wait_for(reader.read(), 5.0)
-            kinds = [kind for kind, _ in frames.Splitter().feed(data)]
-            assert kinds[0] == frames.HELLO
-            assert len(kinds) <= 2
-            writer.close()
-            bus = await open_bus(where)  # and nobody else suffers
-            assert len((await bus.transfer((read(0x4D, 2),))).reads[0]) == 2
-            await bus.close()
-
-    asyncio.run(main())
+async def test_a_client_that_speaks_something_else_is_hung_up_on(garbage: bytes, tmp_path: Path) -> None:
+    async with served("unix", tmp_path) as (where, _, _schedule):
+        reader, writer = await asyncio.open_unix_connection(where.removeprefix("unix:"))
+        writer.write(garbage)
+        data = await asyncio.wait_for(reader.read(), 5.0)
+        kinds = [kind for kind, _ in frames.Splitter().feed(data)]
+        assert kinds[0] == frames.HELLO
+        assert len(kinds) <= 2
+        writer.close()
+        bus = await open_bus(where)  # and nobody else suffers
+        assert len((await bus.transfer((read(0x4D, 2),))).reads[0]) == 2
+        await bus.close()
 
 
-def test_a_client_cannot_order_without_end(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served("unix", tmp_path) as (where, fake, _schedule):
-            _, writer = await asyncio.open_unix_connection(where.removeprefix("unix:"))
-            writer.write(frames.transfer(1, (read(0x4D, 8192),)) * 2000)
-            await asyncio.sleep(0.5)
-            assert fake.bus.transactions <= 5
-            writer.close()
-
-    asyncio.run(main())
+async def test_a_client_cannot_order_without_end(tmp_path: Path) -> None:
+    async with served("unix", tmp_path) as (where, fake, _schedule):
+        _, writer = await asyncio.open_unix_connection(where.removeprefix("unix:"))
+        writer.write(frames.transfer(1, (read(0x4D, 8192),)) * 2000)
+        await asyncio.sleep(0.5)
+        assert fake.bus.transactions <= 5
+        writer.close()
 
 
-def test_a_server_makes_way_for_itself_only(tmp_path: Path) -> None:
-    async def main() -> None:
-        (tmp_path / "file").touch()
-        buses = FakeBuses(SystemClock())
-        with pytest.raises(DeviceRefused, match="no socket"):
-            await BusServer(buses, "x", SystemClock()).listen(f"unix:{tmp_path}/file")
-        with pytest.raises(DeviceRefused, match="cannot listen"):
-            await BusServer(buses, "x", SystemClock()).listen(f"unix:{tmp_path}/no/folder")
-        with socket.socket(socket.AF_UNIX) as crashed:  # leaves its file behind
-            crashed.bind(str(tmp_path / "s"))
-        server = BusServer(buses, "x", SystemClock())
-        await server.listen(f"unix:{tmp_path}/s")
-        await server.close()
-        assert not (tmp_path / "s").exists()
-
-    asyncio.run(main())
+async def test_a_server_makes_way_for_itself_only(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    buses = FakeBuses(SystemClock())
+    with pytest.raises(DeviceRefused, match="no socket"):
+        await BusServer(buses, "x", SystemClock()).listen(f"unix:{tmp_path}/file")
+    with pytest.raises(DeviceRefused, match="cannot listen"):
+        await BusServer(buses, "x", SystemClock()).listen(f"unix:{tmp_path}/no/folder")
+    with socket.socket(socket.AF_UNIX) as crashed:  # leaves its file behind
+        crashed.bind(str(tmp_path / "s"))
+    server = BusServer(buses, "x", SystemClock())
+    await server.listen(f"unix:{tmp_path}/s")
+    await server.close()
+    assert not (tmp_path / "s").exists()
 
 
 def test_the_command_names_what_is_wrong(tmp_path: Path) -> None:

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import re
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from hal.errors import DeviceRefused
-from hal.fake.__main__ import main
-from hal.fake.faults.control import Control, serve_control
-from hal.fake.faults.schedule import FaultSchedule
-from hal.fake.lidar.device import FakeHokuyo
-from hal.fake.transport.pty_server import PtyServer
 from tests.hal.fake.bench import read
-from tests.hal.fake.real_time import gather, on_pty, opened, quiet
+from tests.hal.fake.real_time import gather, opened, quiet
 
 ROOT = Path(__file__).parents[3]
 MD = b"MD0000108000000\n"
@@ -62,42 +54,6 @@ def test_command_serves_takes_orders_and_ends(tmp_path: Path) -> None:
     assert (process.returncode, errors) == (0, "")
     assert "scans made" in out
     assert not link.is_symlink()
-
-
-def test_command_in_this_process(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.savez(tmp_path / "log.npz", range_mm=np.full((2, 1081), 1000))
-    world, socket_ = str(tmp_path / "log.npz"), str(tmp_path / "control")
-    assert main(["--model", "UST-20LX", "--tcp", "127.0.0.1:0", "--world", world, "--cold", "--seconds", "0.1"]) == 0
-    assert main(["--control", socket_, "--seconds", "0.1"]) == 0
-    out = capsys.readouterr().out
-    assert re.search(r"^UST-20LX on tcp://127\.0\.0\.1:\d+\n0 scans made", out)
-    assert "UTM-30LX on /dev/pts/" in out
-    assert f"fault orders on {socket_}\n" in out
-    assert main(["--tcp", "nowhere"]) == main(["--pty", "a", "--tcp", "b:1"]) == main(["--world", "none.npz"]) == 2
-
-
-def test_control_socket(tmp_path: Path) -> None:
-    path = tmp_path / "control"
-
-    async def scene(device: FakeHokuyo, _server: PtyServer) -> None:
-        schedule = FaultSchedule({"lidar": device})
-        for _ in range(2):  # the second time over a stale socket
-            server = await serve_control(Control(schedule), path)
-            reader, writer = await asyncio.open_unix_connection(str(path))
-            writer.write(b"order silence\nclear\n")
-            assert await reader.readline() == b"ordered lidar:silence\n"
-            writer.write(b"x" * 100_000 + b"\n")  # no line of orders is that long: the connection is closed
-            while await reader.read(1000):
-                pass
-            writer.close()
-            server.close()
-        schedule.close()
-
-    on_pty(scene, tmp_path / "lidar")
-    path.unlink(missing_ok=True)
-    path.write_text("precious")
-    with pytest.raises(DeviceRefused, match="no socket"):
-        on_pty(lambda device, _: serve_control(Control(FaultSchedule({"lidar": device})), path), tmp_path / "lidar")  # type: ignore[arg-type,return-value]  # never gets to a server
 
 
 @pytest.mark.parametrize(

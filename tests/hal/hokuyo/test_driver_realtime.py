@@ -64,36 +64,30 @@ async def judged(bench: Bench, again: Callable[[], Awaitable[None]] | None = Non
     assert bench.fake.state is State.IDLE
 
 
-def test_over_a_pty(tmp_path: Path) -> None:
-    async def body() -> None:
-        scene = Scene(UTM_30LX)
-        fake = FakeHokuyo(UTM_30LX, scene)
-        server = PtyServer(fake, tmp_path / "lidar")
-        bench = bench_at(UTM_30LX, str(tmp_path / "lidar"), fake, scene)
-        await bench.say(b"MD0100020001000\n")  # left streaming by somebody else
-        await judged(bench)
-        assert bench.faults is not None
-        bench.faults.close()
-        server.close()
-        fake.close()
-
-    asyncio.run(body())
+async def test_over_a_pty(tmp_path: Path) -> None:
+    scene = Scene(UTM_30LX)
+    fake = FakeHokuyo(UTM_30LX, scene)
+    server = PtyServer(fake, tmp_path / "lidar")
+    bench = bench_at(UTM_30LX, str(tmp_path / "lidar"), fake, scene)
+    await bench.say(b"MD0100020001000\n")  # left streaming by somebody else
+    await judged(bench)
+    assert bench.faults is not None
+    bench.faults.close()
+    server.close()
+    fake.close()
 
 
-def test_over_tcp() -> None:
-    async def body() -> None:
-        scene = Scene(UST_10LX)
-        fake = FakeHokuyo(UST_10LX, scene)
-        server = TcpServer(fake)
-        number = await server.listen()
-        bench = bench_at(UST_10LX, f"tcp://127.0.0.1:{number}", fake, scene)
-        await judged(bench)
-        assert bench.faults is not None
-        bench.faults.close()
-        await server.close()
-        fake.close()
-
-    asyncio.run(body())
+async def test_over_tcp() -> None:
+    scene = Scene(UST_10LX)
+    fake = FakeHokuyo(UST_10LX, scene)
+    server = TcpServer(fake)
+    number = await server.listen()
+    bench = bench_at(UST_10LX, f"tcp://127.0.0.1:{number}", fake, scene)
+    await judged(bench)
+    assert bench.faults is not None
+    bench.faults.close()
+    await server.close()
+    fake.close()
 
 
 @pytest.mark.parametrize(("name", "budget_us"), [("MD", 150.0), ("ME", 250.0)])

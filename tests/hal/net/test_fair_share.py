@@ -87,24 +87,21 @@ def test_a_flood_waits_for_the_next_slice_and_is_served_then() -> None:
     assert asyncio.run(run()) == (2, 6)
 
 
-def test_closing_while_waiting_ends_it() -> None:
-    async def run() -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        watch = Watch()
-        share = Share(watch)
+async def test_closing_while_waiting_ends_it() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    watch = Watch()
+    share = Share(watch)
 
-        def serve() -> None:
-            watch.t += SLICE_S * PART
-            ours.recv(1)
+    def serve() -> None:
+        watch.t += SLICE_S * PART
+        ours.recv(1)
 
-        reader = Reader(ours.fileno(), serve, share)
-        for _ in range(3):
-            theirs.send(b"x")
-        await asyncio.sleep(0.002)
-        assert share.held >= 1
-        reader.close()
-        await asyncio.sleep(2 * SLICE_S)
-        ours.close()
-        theirs.close()
-
-    asyncio.run(run())
+    reader = Reader(ours.fileno(), serve, share)
+    for _ in range(3):
+        theirs.send(b"x")
+    await asyncio.sleep(0.002)
+    assert share.held >= 1
+    reader.close()
+    await asyncio.sleep(2 * SLICE_S)
+    ours.close()
+    theirs.close()

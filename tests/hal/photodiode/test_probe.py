@@ -57,21 +57,19 @@ def test_converters_are_named_and_told_from_others(adapter: Adapter) -> None:
     assert "\n  0x49: something that is none of the converters" in str(finding)
 
 
-def test_nothing_is_changed() -> None:
-    async def main() -> None:
-        fake = FakeAdc(Light(), LoopClock(asyncio.get_running_loop()))
-        adc, memory = Adc121c021(Light()), Eeprom24c02()
-        adc.registers[2:6] = [0x24, 0x0123, 0x0456, 0x0007]
-        memory.values = {k: bytes([0]) for k in range(256)}
-        fake.bus.chips |= {0x50: memory, 0x54: adc}
-        buses = FakeBuses(LoopClock(asyncio.get_running_loop()))
-        buses.plug("x", fake)
-        before, contents = adc.registers[2:6], dict(memory.values)
-        await probe_buses(buses, ["x"])
-        assert adc.registers[2:6] == before
-        assert memory.values == contents
-
-    run_virtual(main())
+@pytest.mark.virtual
+async def test_nothing_is_changed() -> None:
+    fake = FakeAdc(Light(), LoopClock(asyncio.get_running_loop()))
+    adc, memory = Adc121c021(Light()), Eeprom24c02()
+    adc.registers[2:6] = [0x24, 0x0123, 0x0456, 0x0007]
+    memory.values = {k: bytes([0]) for k in range(256)}
+    fake.bus.chips |= {0x50: memory, 0x54: adc}
+    buses = FakeBuses(LoopClock(asyncio.get_running_loop()))
+    buses.plug("x", fake)
+    before, contents = adc.registers[2:6], dict(memory.values)
+    await probe_buses(buses, ["x"])
+    assert adc.registers[2:6] == before
+    assert memory.values == contents
 
 
 @pytest.mark.parametrize(

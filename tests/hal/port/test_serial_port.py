@@ -52,87 +52,71 @@ async def until(condition: object, seconds: float = 4.0) -> None:
         await asyncio.sleep(0.002)
 
 
-def test_bytes_both_ways_and_hang_up(pty: Pty) -> None:
-    async def body() -> None:
-        port = await open_port(pty.path, 115200)
-        got: list[tuple[bytes, float]] = []
-        lost: list[HalError] = []
-        os.write(pty.master, b"before start ")
-        port.start(lambda data, t_rx: got.append((data, t_rx)), lost.append)
-        os.write(pty.master, b"\x00\xff\n\r\x11\x13\x03")  # a raw line alters none of these
-        await until(lambda: b"".join(d for d, _ in got) == b"before start \x00\xff\n\r\x11\x13\x03")
-        port.write(b"VV\n")
-        await asyncio.sleep(0.01)
-        assert os.read(pty.master, 100) == b"VV\n"
-        assert all(abs(t - time.monotonic()) < 4.0 for _, t in got)
-        port.set_baud(750000)
-        pty.close()  # unplug
-        await until(lambda: lost)
-        await asyncio.sleep(0.05)
-        assert [type(error) for error in lost] == [DeviceMissing]
-        assert isinstance(port, SerialPort)
-        assert not asyncio.get_running_loop().remove_reader(port._fd)  # a line that hung up is readable for ever
-        assert lost[0].device == port.name
-        assert lost[0].remedy
-        with pytest.raises(DeviceMissing):
-            port.write(b"QT\n")
-        port.close()
-        port.close()
-        with pytest.raises(DeviceMissing):
-            port.write(b"QT\n")
-
-    asyncio.run(body())
+async def test_bytes_both_ways_and_hang_up(pty: Pty) -> None:
+    port = await open_port(pty.path, 115200)
+    got: list[tuple[bytes, float]] = []
+    lost: list[HalError] = []
+    os.write(pty.master, b"before start ")
+    port.start(lambda data, t_rx: got.append((data, t_rx)), lost.append)
+    os.write(pty.master, b"\x00\xff\n\r\x11\x13\x03")  # a raw line alters none of these
+    await until(lambda: b"".join(d for d, _ in got) == b"before start \x00\xff\n\r\x11\x13\x03")
+    port.write(b"VV\n")
+    await asyncio.sleep(0.01)
+    assert os.read(pty.master, 100) == b"VV\n"
+    assert all(abs(t - time.monotonic()) < 4.0 for _, t in got)
+    port.set_baud(750000)
+    pty.close()  # unplug
+    await until(lambda: lost)
+    await asyncio.sleep(0.05)
+    assert [type(error) for error in lost] == [DeviceMissing]
+    assert isinstance(port, SerialPort)
+    assert not asyncio.get_running_loop().remove_reader(port._fd)  # a line that hung up is readable for ever
+    assert lost[0].device == port.name
+    assert lost[0].remedy
+    with pytest.raises(DeviceMissing):
+        port.write(b"QT\n")
+    port.close()
+    port.close()
+    with pytest.raises(DeviceMissing):
+        port.write(b"QT\n")
 
 
-def test_spurious_wake_up_is_no_unplug(pty: Pty) -> None:
-    async def body() -> None:
-        port = await open_port(pty.path, 115200)
-        lost: list[HalError] = []
-        port.start(lambda data, t_rx: None, lost.append)
-        assert isinstance(port, SerialPort)
-        port._readable()
-        assert lost == []
-        port.close()
-
-    asyncio.run(body())
+async def test_spurious_wake_up_is_no_unplug(pty: Pty) -> None:
+    port = await open_port(pty.path, 115200)
+    lost: list[HalError] = []
+    port.start(lambda data, t_rx: None, lost.append)
+    assert isinstance(port, SerialPort)
+    port._readable()
+    assert lost == []
+    port.close()
 
 
-def test_a_line_that_takes_nothing_is_a_fault_not_a_stall(pty: Pty) -> None:
-    async def body() -> None:
-        port = await open_port(pty.path, 115200)
-        with pytest.raises(DeviceFault, match="command bytes"):
-            port.write(b"x" * 409600)
-        began = time.monotonic()
-        port.close()
-        assert time.monotonic() - began < 4.0
-
-    asyncio.run(body())
+async def test_a_line_that_takes_nothing_is_a_fault_not_a_stall(pty: Pty) -> None:
+    port = await open_port(pty.path, 115200)
+    with pytest.raises(DeviceFault, match="command bytes"):
+        port.write(b"x" * 409600)
+    began = time.monotonic()
+    port.close()
+    assert time.monotonic() - began < 4.0
 
 
-def test_second_open_is_refused_as_busy(pty: Pty) -> None:
-    async def body() -> None:
-        port = await open_port(pty.path, 115200)
-        with pytest.raises(DeviceRefused, match=r"in use by another program.*fuser"):
-            await open_port(pty.path, 115200)
-        port.close()
-        again = await open_port(pty.path, 115200)
-        again.close()
-
-    asyncio.run(body())
+async def test_second_open_is_refused_as_busy(pty: Pty) -> None:
+    port = await open_port(pty.path, 115200)
+    with pytest.raises(DeviceRefused, match=r"in use by another program.*fuser"):
+        await open_port(pty.path, 115200)
+    port.close()
+    again = await open_port(pty.path, 115200)
+    again.close()
 
 
-def test_open_errors_name_thing_and_remedy(tmp_path: Path) -> None:
+async def test_open_errors_name_thing_and_remedy(tmp_path: Path) -> None:
     file = tmp_path / "notes.txt"
     file.write_text("hello")
-
-    async def body() -> None:
-        with pytest.raises(DeviceMissing, match=r"/dev/no-such-lidar: no such device .*probe"):
-            await open_port("/dev/no-such-lidar", 115200)
-        for path in (str(file), str(tmp_path), "/dev/null"):
-            with pytest.raises(DeviceRefused, match="not a serial port"):
-                await open_port(path, 115200)
-
-    asyncio.run(body())
+    with pytest.raises(DeviceMissing, match=r"/dev/no-such-lidar: no such device .*probe"):
+        await open_port("/dev/no-such-lidar", 115200)
+    for path in (str(file), str(tmp_path), "/dev/null"):
+        with pytest.raises(DeviceRefused, match="not a serial port"):
+            await open_port(path, 115200)
 
 
 @pytest.mark.parametrize(
@@ -155,16 +139,13 @@ def test_a_device_file_that_no_loaded_module_makes_is_said_to_lack_it(
     assert str(missing).endswith(says)
 
 
-def test_impossible_rate_is_refused(pty: Pty) -> None:
-    async def body() -> None:
-        with pytest.raises(DeviceRefused, match="cannot do -5 bit/s"):
-            await open_port(pty.path, -5)
-        port = await open_port(pty.path, 19200)
-        with pytest.raises(DeviceRefused, match="cannot do -5 bit/s"):
-            port.set_baud(-5)
-        port.close()
-
-    asyncio.run(body())
+async def test_impossible_rate_is_refused(pty: Pty) -> None:
+    with pytest.raises(DeviceRefused, match="cannot do -5 bit/s"):
+        await open_port(pty.path, -5)
+    port = await open_port(pty.path, 19200)
+    with pytest.raises(DeviceRefused, match="cannot do -5 bit/s"):
+        port.set_baud(-5)
+    port.close()
 
 
 @pytest.mark.parametrize(
@@ -212,7 +193,7 @@ def test_permission_remedy_names_the_group_of_the_device(tmp_path: Path, monkeyp
     assert stat.S_ISCHR(Path("/dev/null").stat().st_mode)
 
 
-def test_cancelled_open_leaves_nothing_open(pty: Pty, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_cancelled_open_leaves_nothing_open(pty: Pty, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[serial.Serial] = []
     real = serial.Serial
 
@@ -222,14 +203,10 @@ def test_cancelled_open_leaves_nothing_open(pty: Pty, monkeypatch: pytest.Monkey
         return opened[-1]
 
     monkeypatch.setattr("hal.port.serial_port.serial.Serial", slow)
-
-    async def body() -> None:
-        task = asyncio.create_task(open_port(pty.path, 115200))
-        await asyncio.sleep(0.02)
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-        await until(lambda: opened)
-        await until(lambda: not opened[0].is_open)
-
-    asyncio.run(body())
+    task = asyncio.create_task(open_port(pty.path, 115200))
+    await asyncio.sleep(0.02)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    await until(lambda: opened)
+    await until(lambda: not opened[0].is_open)

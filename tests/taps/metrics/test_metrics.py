@@ -117,14 +117,11 @@ def test_position_and_what_is_no_request(tmp_path: Path) -> None:
         with_server(tmp_path / "s", body)
 
 
-def test_the_address_that_is_printed_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    async def run() -> None:
-        serving = asyncio.ensure_future(serve(Stream(tmp_path / "s", server.TOPICS), "::1", 0))
-        await asyncio.sleep(0.1)
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
-
-    asyncio.run(run())
+async def test_the_address_that_is_printed_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    serving = asyncio.ensure_future(serve(Stream(tmp_path / "s", server.TOPICS), "::1", 0))
+    await asyncio.sleep(0.1)
+    serving.cancel()
+    await asyncio.gather(serving, return_exceptions=True)
     assert re.search(r"http://\[::1\]:\d+/metrics", capsys.readouterr().err)
 
 

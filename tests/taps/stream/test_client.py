@@ -33,7 +33,7 @@ from daemon.snapshot import (
     Trust,
 )
 from hal.adc import Blemish, RawSamples
-from tests.daemon.publish.stream.test_server import raw_scan, run
+from tests.daemon.publish.stream.test_server import raw_scan, running
 from tests.taps.serving import served
 
 LINK = LightLink(5, 12, LinkUse.ACCEPTED, 1e-6, 0.01)
@@ -63,8 +63,8 @@ async def first(told: Stream, kind: type[Frame | Lost]) -> Frame | Lost:
     raise AssertionError("it ended")
 
 
-def test_every_topic_arrives_with_its_type(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_every_topic_arrives_with_its_type(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         seen: dict[type, Frame] = {}
         async with aclosing(Stream(server.path, tuple(set(TOPICS) - {"map"})).frames()) as heard:
             async for frame in heard:
@@ -89,8 +89,6 @@ def test_every_topic_arrives_with_its_type(tmp_path: Path) -> None:
         assert isinstance(scan, messages.Scan)
         np.testing.assert_array_equal(scan.ranges_m(), np.array([1.0, np.nan, 2.5], np.float32))
 
-    run(tmp_path / "stream", body)
-
 
 def tell_all(server: StreamServer) -> None:
     server.publish(FULL)
@@ -101,34 +99,30 @@ def tell_all(server: StreamServer) -> None:
     server.on_samples(RawSamples(1, 0.0, 0.1, 2.0, 22222.2, np.array([1, 513], np.uint16), 12, Blemish(0), 0.0))
 
 
-def test_a_daemon_that_goes_is_told_once_and_one_that_comes_is_greeted(
+async def test_a_daemon_that_goes_is_told_once_and_one_that_comes_is_greeted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(client, "FIRST_RETRY_S", 0.01)
     path = tmp_path / "stream"
-
-    async def body() -> None:
-        seen: list[str] = []
-        serving: asyncio.Task[None] | None = None
-        async with asyncio.timeout(10.0), aclosing(Stream(path, ("pose",)).frames()) as heard:
-            async for frame in heard:
-                seen.append(type(frame).__name__)
-                if isinstance(frame, Lost) and len(seen) == 1:
-                    assert "is the daemon running?" in frame.text
-                    serving = serve(path)
-                elif isinstance(frame, Hello) and len(seen) == 2:
-                    assert serving is not None
-                    serving.cancel()
-                elif len(seen) == 3:
-                    serving = serve(path)
-                elif len(seen) == 4:
-                    break
-        assert serving is not None
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
-        assert seen == ["Lost", "Hello", "Lost", "Hello"]
-
-    asyncio.run(body())
+    seen: list[str] = []
+    serving: asyncio.Task[None] | None = None
+    async with asyncio.timeout(10.0), aclosing(Stream(path, ("pose",)).frames()) as heard:
+        async for frame in heard:
+            seen.append(type(frame).__name__)
+            if isinstance(frame, Lost) and len(seen) == 1:
+                assert "is the daemon running?" in frame.text
+                serving = serve(path)
+            elif isinstance(frame, Hello) and len(seen) == 2:
+                assert serving is not None
+                serving.cancel()
+            elif len(seen) == 3:
+                serving = serve(path)
+            elif len(seen) == 4:
+                break
+    assert serving is not None
+    serving.cancel()
+    await asyncio.gather(serving, return_exceptions=True)
+    assert seen == ["Lost", "Hello", "Lost", "Hello"]
 
 
 def test_one_that_is_not_patient_ends(tmp_path: Path) -> None:
@@ -265,17 +259,15 @@ def test_types_stand_for_every_topic() -> None:
     assert set(TYPES) == set(TOPICS)
 
 
-def test_a_daemon_of_a_name_is_found_wherever_it_comes_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_daemon_of_a_name_is_found_wherever_it_comes_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A person starts to listen, and the system's service is started later."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "own"))
     monkeypatch.setattr("daemon.config.paths.SERVICE", tmp_path)
-
-    async def body() -> None:
-        async with asyncio.timeout(10.0), contextlib.aclosing(Stream("agv", ("pose",)).frames()) as frames:
-            first = await anext(frames)
-            assert isinstance(first, Lost)
-            assert str(tmp_path / "own" / "agv.stream") in first.text
-            with served(tmp_path / "agv.stream"):
-                assert isinstance(await anext(frames), Hello)
-
-    asyncio.run(body())
+    async with asyncio.timeout(10.0), contextlib.aclosing(Stream("agv", ("pose",)).frames()) as frames:
+        first = await anext(frames)
+        assert isinstance(first, Lost)
+        assert str(tmp_path / "own" / "agv.stream") in first.text
+        with served(tmp_path / "agv.stream"):
+            assert isinstance(await anext(frames), Hello)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import zlib
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -81,112 +80,93 @@ async def wired(house: House) -> AsyncIterator[tuple[Wire, str]]:
         await wire.end()
 
 
-def run(folder: Path, body: Callable[[House], Awaitable[None]], **options: Any) -> None:
-    async def all_of_it() -> None:
-        async with serving(folder, **options) as house:
-            await body(house)
-
-    asyncio.run(all_of_it())
-
-
 async def shows(page: Tab, text: str, seconds: float = 20.0) -> None:
     await page.until(f"({BANNER}).includes({text!r})", seconds)
 
 
-def test_a_dead_wire_is_no_daemon_that_stands_and_the_page_comes_back(browser: str, tmp_path: Path) -> None:
-    async def body(house: House) -> None:
-        async with wired(house) as (wire, address), tab(browser, f"{address}/#token={TOKEN}") as page:
-            await page.until("globalThis.lumiloop")
-            house.stream.publish(snapshot(1))
-            await page.until(f"{POSE} === 1")
-            wire.cut = True
-            await page.click("[data-order=relocalise]")  # into a wire that takes it
-            await page.js(f"globalThis.told = []; setInterval(() => told.push({BANNER}), 50); 0")
-            await shows(page, "No connection to this page")
-            assert not [text for text in await page.js("told") if "the daemon stands" in text]
-            await page.until("document.getElementById('state-name').textContent === 'NO SERVER'")
-            await page.until("document.getElementById('told').textContent.includes('connection lost')")
-            await page.click("[data-order=save_map]")
-            await page.until(
-                "[...document.querySelectorAll('#told li')].some((one) =>"
-                "one.textContent.includes('Save map (you): not sent, there is no connection'))"
-            )
-            wire.cut = False
-            house.stream.publish(snapshot(2))
-            await page.until(f"{POSE} === 2")
-            await page.until(f"({BANNER}) === ''")
+async def test_a_dead_wire_is_no_daemon_that_stands_and_the_page_comes_back(browser: str, tmp_path: Path) -> None:
+    async with (
+        serving(tmp_path, guard=Guard("127.0.0.1", TOKEN, True)) as house,
+        wired(house) as (wire, address),
+        tab(browser, f"{address}/#token={TOKEN}") as page,
+    ):
+        await page.until("globalThis.lumiloop")
+        house.stream.publish(snapshot(1))
+        await page.until(f"{POSE} === 1")
+        wire.cut = True
+        await page.click("[data-order=relocalise]")  # into a wire that takes it
+        await page.js(f"globalThis.told = []; setInterval(() => told.push({BANNER}), 50); 0")
+        await shows(page, "No connection to this page")
+        assert not [text for text in await page.js("told") if "the daemon stands" in text]
+        await page.until("document.getElementById('state-name').textContent === 'NO SERVER'")
+        await page.until("document.getElementById('told').textContent.includes('connection lost')")
+        await page.click("[data-order=save_map]")
+        await page.until(
+            "[...document.querySelectorAll('#told li')].some((one) =>"
+            "one.textContent.includes('Save map (you): not sent, there is no connection'))"
+        )
+        wire.cut = False
+        house.stream.publish(snapshot(2))
+        await page.until(f"{POSE} === 2")
+        await page.until(f"({BANNER}) === ''")
 
-    run(tmp_path, body, guard=Guard("127.0.0.1", TOKEN, True))
 
-
-def test_a_browser_that_cannot_draw_the_map_says_so(browser: str, tmp_path: Path) -> None:
+async def test_a_browser_that_cannot_draw_the_map_says_so(browser: str, tmp_path: Path) -> None:
     """A phone of 2022 had shown everything but the map, and no word of why."""
 
-    async def body(house: House) -> None:
-        async with tab(browser, house.address) as page:
-            await page.ask("Page.addScriptToEvaluateOnNewDocument", source="delete globalThis.DecompressionStream")
-            await page.ask("Page.reload")
-            await page.until("!('DecompressionStream' in globalThis) && globalThis.lumiloop")
-            await shows(page, "too old to draw the map")
-            tiles = MapTiles(
-                map_id=7, resolution=0.05, side=128, unit=0.1, version=1, more=False,
-                tiles=((0, 0, zlib.compress(bytes([20]) * 128 * 128)),),
-            )  # fmt: skip
-            house.view.hub.distribute(tiles)
-            house.stream.publish(snapshot(1))
-            await page.until(f"{POSE} === 1")
-            assert page.said == []
-
-    run(tmp_path, body)
+    async with serving(tmp_path) as house, tab(browser, house.address) as page:
+        await page.ask("Page.addScriptToEvaluateOnNewDocument", source="delete globalThis.DecompressionStream")
+        await page.ask("Page.reload")
+        await page.until("!('DecompressionStream' in globalThis) && globalThis.lumiloop")
+        await shows(page, "too old to draw the map")
+        tiles = MapTiles(
+            map_id=7, resolution=0.05, side=128, unit=0.1, version=1, more=False,
+            tiles=((0, 0, zlib.compress(bytes([20]) * 128 * 128)),),
+        )  # fmt: skip
+        house.view.hub.distribute(tiles)
+        house.stream.publish(snapshot(1))
+        await page.until(f"{POSE} === 1")
+        assert page.said == []
 
 
-def test_a_daemon_that_stands_is_still_named(browser: str, tmp_path: Path) -> None:
-    async def body(house: House) -> None:
-        async with tab(browser, house.address) as page:
-            await page.until("globalThis.lumiloop")
-            house.stream.publish(snapshot(1))
-            await page.until(f"{POSE} === 1")
-            await shows(page, "the daemon stands")
-
-    run(tmp_path, body)
+async def test_a_daemon_that_stands_is_still_named(browser: str, tmp_path: Path) -> None:
+    async with serving(tmp_path) as house, tab(browser, house.address) as page:
+        await page.until("globalThis.lumiloop")
+        house.stream.publish(snapshot(1))
+        await page.until(f"{POSE} === 1")
+        await shows(page, "the daemon stands")
 
 
-def test_who_closes_the_question_for_a_token_is_told_why_nothing_is_shown_and_is_asked_again(
+async def test_who_closes_the_question_for_a_token_is_told_why_nothing_is_shown_and_is_asked_again(
     browser: str, tmp_path: Path
 ) -> None:
-    async def body(house: House) -> None:
-        async with tab(browser, house.address) as page:
-            await page.until("globalThis.lumiloop")
-            await page.until("document.getElementById('token').open")
-            await page.until("document.getElementById('state-name').textContent === 'NO TOKEN'")
-            assert "trying again" not in await page.js("document.body.innerText")
-            await page.js("document.getElementById('token').close()")  # as Escape does
-            await shows(page, "Not shown without a token")
-            await page.click("#banner")
-            await page.until("document.getElementById('token').open")
-            await page.js(f"document.getElementById('token-text').value = '{TOKEN}'; 0")
-            await page.click("#token .go")
-            house.stream.publish(snapshot(1))
-            await page.until(f"{POSE} === 1")
-            await page.until(f"({BANNER}) === ''")
-
-    run(tmp_path, body, guard=Guard("0.0.0.0", TOKEN))
+    async with serving(tmp_path, guard=Guard("0.0.0.0", TOKEN)) as house, tab(browser, house.address) as page:
+        await page.until("globalThis.lumiloop")
+        await page.until("document.getElementById('token').open")
+        await page.until("document.getElementById('state-name').textContent === 'NO TOKEN'")
+        assert "trying again" not in await page.js("document.body.innerText")
+        await page.js("document.getElementById('token').close()")  # as Escape does
+        await shows(page, "Not shown without a token")
+        await page.click("#banner")
+        await page.until("document.getElementById('token').open")
+        await page.js(f"document.getElementById('token-text').value = '{TOKEN}'; 0")
+        await page.click("#token .go")
+        house.stream.publish(snapshot(1))
+        await page.until(f"{POSE} === 1")
+        await page.until(f"({BANNER}) === ''")
 
 
-def test_a_browser_too_many_comes_in_when_another_goes(
+async def test_a_browser_too_many_comes_in_when_another_goes(
     browser: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server, "VIEWERS", 1)
 
-    async def body(house: House) -> None:
-        async with house.page() as first:
-            await first.welcome()
-            async with tab(browser, house.address) as page:
-                await page.until("globalThis.lumiloop")
-                await shows(page, "browsers are watching; close one. Trying again.")
-                await first.socket.close()
-                house.stream.publish(snapshot(1))
-                await page.until(f"{POSE} === 1", 20.0)
-                await page.until(f"({BANNER}) === ''")
-
-    run(tmp_path, body)
+    async with serving(tmp_path) as house, house.page() as first:
+        await first.welcome()
+        async with tab(browser, house.address) as page:
+            await page.until("globalThis.lumiloop")
+            await shows(page, "browsers are watching; close one. Trying again.")
+            await first.socket.close()
+            house.stream.publish(snapshot(1))
+            await page.until(f"{POSE} === 1", 20.0)
+            await page.until(f"({BANNER}) === ''")

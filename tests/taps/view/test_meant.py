@@ -36,36 +36,28 @@ def other() -> Iterator[tuple[int, subprocess.Popen[str]]]:
             process.kill()
 
 
-def test_another_daemon_is_not_ordered_about(tmp_path: Path, other: tuple[int, subprocess.Popen[str]]) -> None:
+async def test_another_daemon_is_not_ordered_about(tmp_path: Path, other: tuple[int, subprocess.Popen[str]]) -> None:
     """As where two run here and the page's configuration names the port of the wrong one."""
     port, process = other
-
-    async def body() -> None:
-        async with serving(tmp_path, Guard("127.0.0.1", TOKEN, True), modbus=port) as house, house.page(TOKEN) as page:
-            await page.welcome()
-            await page.socket.send_json({"order": "set_pose", "pose": [1.0, 2.0, 0.0]})
-            said = (await page.until("order"))["outcome"]
-        assert f"127.0.0.1:{port} is answered by process {process.pid}" in said
-        assert "--config" in said
-
-    asyncio.run(body())
+    async with serving(tmp_path, Guard("127.0.0.1", TOKEN, True), modbus=port) as house, house.page(TOKEN) as page:
+        await page.welcome()
+        await page.socket.send_json({"order": "set_pose", "pose": [1.0, 2.0, 0.0]})
+        said = (await page.until("order"))["outcome"]
+    assert f"127.0.0.1:{port} is answered by process {process.pid}" in said
+    assert "--config" in said
     process.kill()
     assert process.stdout is not None
     assert process.stdout.read() == "", "it was asked nothing"
 
 
-def test_nor_is_its_map_switched(
+async def test_nor_is_its_map_switched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: tuple[int, subprocess.Popen[str]]
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-
-    async def body() -> None:
-        path = stream_path("agv")
-        server = await asyncio.start_unix_server(lambda reader, writer: writer.close(), path)
-        try:
-            with pytest.raises(CommandRefused, match="not by the daemon that is meant"):
-                await switch_map("agv", "127.0.0.1", other[0], 1)
-        finally:
-            server.close()
-
-    asyncio.run(body())
+    path = stream_path("agv")
+    server = await asyncio.start_unix_server(lambda reader, writer: writer.close(), path)
+    try:
+        with pytest.raises(CommandRefused, match="not by the daemon that is meant"):
+            await switch_map("agv", "127.0.0.1", other[0], 1)
+    finally:
+        server.close()

@@ -53,75 +53,65 @@ def film(tmp_path: Path) -> ReplayFile:
     return ReplayFile(tmp_path, file)
 
 
-def test_any_instant_is_shown_as_if_one_had_watched_until_then(film: ReplayFile) -> None:
-    async def body() -> None:
-        film.refresh()
-        assert (film.t_first, film.t_last, film.done) == (10.0, 20.0, False)
-        viewer = Viewer(1)
-        player = ReplayPlayer(film, viewer)
-        player.seek(16.5)
-        seen = told(viewer)
-        assert [data for topic, data in seen if topic == "pose"] == [{"t_mono": 16}]
-        assert [data for topic, data in seen if topic == "row"] == [[t] for t in range(10, 17)]
-        assert ("loops", [{"counter": 1}]) in seen  # of the past: it does not happen now
-        assert not [data for topic, data in seen if topic == "loop"]
-        assert sorted(seen[-1][1]["tiles"]) == [[0, 0, b"a"], [1, 0, b"c"]]
-        player.seek(12.5)  # back: what has been drawn since is not there
-        seen = told(viewer)
-        assert [topic for topic, _ in seen[:2]] == ["daemon", "rewound"]
-        assert not [data for topic, data in seen if topic in ("loop", "loops")]
-        assert seen[-1][1]["tiles"] == [[1, 0, b""]]
-        player.speed = 4.0
-        player.advance(1.5)
-        seen = told(viewer)
-        assert player.at == 18.5
-        assert [data for topic, data in seen if topic == "pose"] == [{"t_mono": 18}]
-        assert [data for topic, data in seen if topic == "row"] == [[t] for t in range(13, 19)]
-        assert ("loop", {"counter": 1}) in seen  # it is played
-        assert sorted(seen[-1][1]["tiles"]) == [[0, 0, b"b"], [1, 0, b"c"]]
-        player.advance(60.0)
-        assert player.at == 20.0
-        film.close()
-
-    asyncio.run(body())
+async def test_any_instant_is_shown_as_if_one_had_watched_until_then(film: ReplayFile) -> None:
+    film.refresh()
+    assert (film.t_first, film.t_last, film.done) == (10.0, 20.0, False)
+    viewer = Viewer(1)
+    player = ReplayPlayer(film, viewer)
+    player.seek(16.5)
+    seen = told(viewer)
+    assert [data for topic, data in seen if topic == "pose"] == [{"t_mono": 16}]
+    assert [data for topic, data in seen if topic == "row"] == [[t] for t in range(10, 17)]
+    assert ("loops", [{"counter": 1}]) in seen  # of the past: it does not happen now
+    assert not [data for topic, data in seen if topic == "loop"]
+    assert sorted(seen[-1][1]["tiles"]) == [[0, 0, b"a"], [1, 0, b"c"]]
+    player.seek(12.5)  # back: what has been drawn since is not there
+    seen = told(viewer)
+    assert [topic for topic, _ in seen[:2]] == ["daemon", "rewound"]
+    assert not [data for topic, data in seen if topic in ("loop", "loops")]
+    assert seen[-1][1]["tiles"] == [[1, 0, b""]]
+    player.speed = 4.0
+    player.advance(1.5)
+    seen = told(viewer)
+    assert player.at == 18.5
+    assert [data for topic, data in seen if topic == "pose"] == [{"t_mono": 18}]
+    assert [data for topic, data in seen if topic == "row"] == [[t] for t in range(13, 19)]
+    assert ("loop", {"counter": 1}) in seen  # it is played
+    assert sorted(seen[-1][1]["tiles"]) == [[0, 0, b"b"], [1, 0, b"c"]]
+    player.advance(60.0)
+    assert player.at == 20.0
+    film.close()
 
 
-def test_a_bar_that_is_dragged_before_there_is_a_pose_blanks_nothing(tmp_path: Path) -> None:
+async def test_a_bar_that_is_dragged_before_there_is_a_pose_blanks_nothing(tmp_path: Path) -> None:
     file = tmp_path / "film"
     file.touch()
     film = ReplayFile(tmp_path, file)
-
-    async def body() -> None:
-        viewer = Viewer(1)
-        player = ReplayPlayer(film, viewer)
-        player.control({"at": 0.0, "speed": 2.0})
-        playing = asyncio.create_task(player.run())
-        write(file, *((t, "pose", frame("pose", {"t_mono": t})) for t in (10, 11)))
-        for _ in range(100):
-            await asyncio.sleep(0.02)
-            if player.at >= 10.0:
-                break
-        playing.cancel()
-        assert (player.speed, player.at >= 10.0) == (2.0, True)
-        assert ("pose", {"t_mono": 10}) in told(viewer)
-        film.close()
-
-    asyncio.run(body())
+    viewer = Viewer(1)
+    player = ReplayPlayer(film, viewer)
+    player.control({"at": 0.0, "speed": 2.0})
+    playing = asyncio.create_task(player.run())
+    write(file, *((t, "pose", frame("pose", {"t_mono": t})) for t in (10, 11)))
+    for _ in range(100):
+        await asyncio.sleep(0.02)
+        if player.at >= 10.0:
+            break
+    playing.cancel()
+    assert (player.speed, player.at >= 10.0) == (2.0, True)
+    assert ("pose", {"t_mono": 10}) in told(viewer)
+    film.close()
 
 
-def test_tiles_on_their_way_when_the_time_leaps_are_told_again(film: ReplayFile) -> None:
-    async def body() -> None:
-        film.refresh()
-        viewer = Viewer(1)
-        player = ReplayPlayer(film, viewer)
-        player.seek(16.5)
-        player.seek(17.0)  # the bar is dragged: nothing of the first instant has reached the browser
-        assert sorted(told(viewer)[-1][1]["tiles"]) == [[0, 0, b"a"], [1, 0, b"c"]]
-        player.seek(16.0)  # all of it has: it is not told twice
-        assert not [data for topic, data in told(viewer) if topic == "map"]
-        film.close()
-
-    asyncio.run(body())
+async def test_tiles_on_their_way_when_the_time_leaps_are_told_again(film: ReplayFile) -> None:
+    film.refresh()
+    viewer = Viewer(1)
+    player = ReplayPlayer(film, viewer)
+    player.seek(16.5)
+    player.seek(17.0)  # the bar is dragged: nothing of the first instant has reached the browser
+    assert sorted(told(viewer)[-1][1]["tiles"]) == [[0, 0, b"a"], [1, 0, b"c"]]
+    player.seek(16.0)  # all of it has: it is not told twice
+    assert not [data for topic, data in told(viewer) if topic == "map"]
+    film.close()
 
 
 def test_a_film_that_is_still_being_made(film: ReplayFile, tmp_path: Path) -> None:
@@ -170,18 +160,15 @@ def test_a_recording_that_ends_early_does_not_look_whole() -> None:
 
 
 @pytest.mark.parametrize("words", [None, 7, [], {"at": "x"}, {"speed": float("inf")}, {"paused": 1}, {"at": True}])
-def test_a_page_that_talks_nonsense(film: ReplayFile, words: object) -> None:
-    async def body() -> None:
-        film.refresh()
-        player = ReplayPlayer(film, Viewer(1))
-        player.seek(15.0)
-        player.control(words)
-        assert (player.at, player.speed, player.paused) == (15.0, 1.0, False)
-        player.control({"at": -1e300, "speed": 1e300})
-        assert (player.at, player.speed) == (10.0, 60.0)
-        film.close()
-
-    asyncio.run(body())
+async def test_a_page_that_talks_nonsense(film: ReplayFile, words: object) -> None:
+    film.refresh()
+    player = ReplayPlayer(film, Viewer(1))
+    player.seek(15.0)
+    player.control(words)
+    assert (player.at, player.speed, player.paused) == (15.0, 1.0, False)
+    player.control({"at": -1e300, "speed": 1e300})
+    assert (player.at, player.speed) == (10.0, 60.0)
+    film.close()
 
 
 def test_a_recording_is_shown_from_its_beginning_and_takes_no_orders(recording: Path, tmp_path: Path) -> None:

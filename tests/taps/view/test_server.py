@@ -6,7 +6,6 @@ import asyncio
 import logging
 import re
 import socket
-from collections.abc import Awaitable, Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -22,19 +21,11 @@ from daemon.snapshot import State
 from taps.access_guard import Guard
 from taps.view import server, viewers
 from tests.daemon.publish.stream.test_server import raw_scan, until
-from tests.taps.view.house import TOKEN, House, serving, snapshot
+from tests.taps.view.house import TOKEN, serving, snapshot
 
 
-def run(folder: Path, body: Callable[[House], Awaitable[None]], **options: Any) -> None:
-    async def all_of_it() -> None:
-        async with serving(folder, **options) as house:
-            await body(house)
-
-    asyncio.run(all_of_it())
-
-
-def test_the_page_is_whole_and_fetches_nothing_from_elsewhere(tmp_path: Path) -> None:
-    async def body(house: House) -> None:
+async def test_the_page_is_whole_and_fetches_nothing_from_elsewhere(tmp_path: Path) -> None:
+    async with serving(tmp_path) as house:
         async with house.session.get(house.address) as answer:
             page = await answer.text()
             policy = answer.headers["Content-Security-Policy"]
@@ -56,16 +47,14 @@ def test_the_page_is_whole_and_fetches_nothing_from_elsewhere(tmp_path: Path) ->
             async with house.session.get(f"{house.address}/{missing}") as answer:
                 assert answer.status == 404
                 assert "Content-Security-Policy" in answer.headers
-
-    run(tmp_path, body)
     folder = resources.files("taps.view").joinpath("page")
     for entry in folder.iterdir():
         text = entry.read_text().replace("http://www.w3.org/2000/svg", "").replace("https://msgpack.org", "")
         assert not re.search(r"https?://|//cdn|@import|\son[a-z]+=|<style|style=\"|innerHTML|eval\(", text), entry.name
 
 
-def test_a_name_that_is_not_ours_is_not_answered(tmp_path: Path) -> None:
-    async def body(house: House) -> None:
+async def test_a_name_that_is_not_ours_is_not_answered(tmp_path: Path) -> None:
+    async with serving(tmp_path) as house:
         for host, status in (("evil.example", 421), ("evil.example:8090", 421), ("localhost:1", 200), ("[::1]", 200)):
             async with house.session.get(house.address, headers={"Host": host}) as answer:
                 assert answer.status == status, host
@@ -76,13 +65,13 @@ def test_a_name_that_is_not_ours_is_not_answered(tmp_path: Path) -> None:
         async with house.page(Origin=house.address) as page:
             assert (await page.welcome())["kind"] == "welcome"
 
-    run(tmp_path, body)
 
-
-def test_without_the_token_one_may_not_look_from_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_without_the_token_one_may_not_look_from_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(server, "WRONG_TOKEN_S", 0.01)
 
-    async def body(house: House) -> None:
+    async with serving(tmp_path, guard=Guard("0.0.0.0", TOKEN)) as house:
         for token in (None, TOKEN[:-1], "", 7, TOKEN * 9):
             async with house.page(token) as page:  # type: ignore[arg-type]  # as a stranger may send it
                 assert (await page.welcome())["what"] == "token"
@@ -91,11 +80,9 @@ def test_without_the_token_one_may_not_look_from_elsewhere(tmp_path: Path, monke
             told = await page.welcome()
             assert (told["kind"], told["orders"]) == ("welcome", {})
 
-    run(tmp_path, body, guard=Guard("0.0.0.0", TOKEN))
 
-
-def test_what_the_stream_tells_is_handed_on(tmp_path: Path) -> None:
-    async def body(house: House) -> None:
+async def test_what_the_stream_tells_is_handed_on(tmp_path: Path) -> None:
+    async with serving(tmp_path) as house:
         async with house.page() as page:
             told = await page.welcome()
             assert (told["name"], told["states"]["3"][0]) == ("agv", "TRACKING")
@@ -118,25 +105,20 @@ def test_what_the_stream_tells_is_handed_on(tmp_path: Path) -> None:
             assert [one["counter"] for one in await late.until("loops")] == [1]
             assert (await late.until("pose"))["seq"] == 2
 
-    run(tmp_path, body)
+
+async def test_a_daemon_that_goes_and_comes_again(tmp_path: Path) -> None:
+    async with serving(tmp_path) as house, house.page() as page:
+        await page.welcome()
+        first = await page.until("daemon", lambda told: told["up"])
+        for client in list(house.stream.clients):
+            client.drop()
+        assert "closed the stream" in (await page.until("daemon", lambda told: not told["up"]))["why"]
+        again = await page.until("daemon", lambda told: told["up"])
+        assert again["session"] == first["session"] + 1
 
 
-def test_a_daemon_that_goes_and_comes_again(tmp_path: Path) -> None:
-    async def body(house: House) -> None:
-        async with house.page() as page:
-            await page.welcome()
-            first = await page.until("daemon", lambda told: told["up"])
-            for client in list(house.stream.clients):
-                client.drop()
-            assert "closed the stream" in (await page.until("daemon", lambda told: not told["up"]))["why"]
-            again = await page.until("daemon", lambda told: told["up"])
-            assert again["session"] == first["session"] + 1
-
-    run(tmp_path, body)
-
-
-def test_a_daemon_of_another_version_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def body(house: House) -> None:
+async def test_a_daemon_of_another_version_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with serving(tmp_path) as house:
         monkeypatch.setattr(daemon_stream, "SCHEMA", 2)
         async with house.page() as page:
             await page.welcome()
@@ -145,13 +127,11 @@ def test_a_daemon_of_another_version_is_named(tmp_path: Path, monkeypatch: pytes
                 client.drop()
             await page.until("daemon", lambda told: "version 2 of the stream" in told["why"])
 
-    run(tmp_path, body)
 
-
-def test_too_many_browsers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_too_many_browsers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "VIEWERS", 1)
 
-    async def body(house: House) -> None:
+    async with serving(tmp_path) as house:
         async with house.page() as page:
             await page.welcome()
             async with house.page() as other:  # in words: a page cannot read why a handshake failed
@@ -161,28 +141,23 @@ def test_too_many_browsers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         async with house.page() as other:
             assert (await other.welcome())["kind"] == "welcome", "one has gone"
 
-    run(tmp_path, body)
-
 
 @pytest.mark.parametrize("words", ["no JSON", "[1]", '{"order": "save_map"', "[" * 3000, r'{"order": "\ud800"}'])
-def test_nonsense_ends_a_connection_and_nothing_else(
+async def test_nonsense_ends_a_connection_and_nothing_else(
     tmp_path: Path, words: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def body(house: House) -> None:
-        async with house.page() as page, house.page() as other:
-            await page.welcome()
-            await other.welcome()
-            await page.socket.send_str(words)
-            while await page.read():
-                pass
-            house.stream.publish(snapshot(1))
-            await other.until("pose")
-
-    run(tmp_path, body)
+    async with serving(tmp_path) as house, house.page() as page, house.page() as other:
+        await page.welcome()
+        await other.welcome()
+        await page.socket.send_str(words)
+        while await page.read():
+            pass
+        house.stream.publish(snapshot(1))
+        await other.until("pose")
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR], "it is no defect of ours"
 
 
-def test_a_page_that_is_closed_while_it_is_greeted_is_no_error(
+async def test_a_page_that_is_closed_while_it_is_greeted_is_no_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     greet, requests = server.welcome, list[Any]()
@@ -191,7 +166,7 @@ def test_a_page_that_is_closed_while_it_is_greeted_is_no_error(
         requests[0].transport.abort()
         return greet(*told)
 
-    async def body(house: House) -> None:
+    async with serving(tmp_path) as house:
         monkeypatch.setattr(server, "_limit_buffers", requests.append)
         monkeypatch.setattr(server, "welcome", closed)
         async with house.page() as page:
@@ -200,43 +175,40 @@ def test_a_page_that_is_closed_while_it_is_greeted_is_no_error(
         monkeypatch.setattr(server, "welcome", greet)
         async with house.page() as other:
             await other.welcome()
-
-    run(tmp_path, body)
     assert len(requests) == 2
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
-def test_a_browser_that_takes_nothing_gets_the_latest() -> None:
-    async def body() -> None:
-        viewer = viewers.Viewer(1)
-        for number in range(100):
-            viewer.put("pose", viewers.frame("pose", number))
-            viewer.put("loop", viewers.frame("loop", number), once=True)
-            viewer.put_tiles({"side": 2}, [((0, 0), bytes([number])), ((number % 3, 1), bytes(40_000))])
-        message = viewer.next_message()
-        assert message is not None
-        told = msgspec.msgpack.decode(message)
-        loops = [one["data"] for one in told if one["topic"] == "loop"]
-        assert loops == list(range(100 - viewers.KEPT, 100))
-        assert [one["data"] for one in told if one["topic"] == "pose"] == [99]
-        tiles = [one for one in told if one["topic"] == "map"]
-        assert tiles[0]["data"]["tiles"][0] == [0, 0, bytes([99])]
-        assert viewer.pending.is_set()  # there are more tiles than fit into one message
-        rest = viewer.next_message()
-        assert rest is not None
-        assert len(msgspec.msgpack.decode(rest)[0]["data"]["tiles"]) == 1
-        assert viewer.next_message() is None
-        assert viewer.replaced == 99 + 100 - viewers.KEPT
-
-    asyncio.run(body())
+async def test_a_browser_that_takes_nothing_gets_the_latest() -> None:
+    viewer = viewers.Viewer(1)
+    for number in range(100):
+        viewer.put("pose", viewers.frame("pose", number))
+        viewer.put("loop", viewers.frame("loop", number), once=True)
+        viewer.put_tiles({"side": 2}, [((0, 0), bytes([number])), ((number % 3, 1), bytes(40_000))])
+    message = viewer.next_message()
+    assert message is not None
+    told = msgspec.msgpack.decode(message)
+    loops = [one["data"] for one in told if one["topic"] == "loop"]
+    assert loops == list(range(100 - viewers.KEPT, 100))
+    assert [one["data"] for one in told if one["topic"] == "pose"] == [99]
+    tiles = [one for one in told if one["topic"] == "map"]
+    assert tiles[0]["data"]["tiles"][0] == [0, 0, bytes([99])]
+    assert viewer.pending.is_set()  # there are more tiles than fit into one message
+    rest = viewer.next_message()
+    assert rest is not None
+    assert len(msgspec.msgpack.decode(rest)[0]["data"]["tiles"]) == 1
+    assert viewer.next_message() is None
+    assert viewer.replaced == 99 + 100 - viewers.KEPT
 
 
-def test_little_that_is_old_is_on_its_way_to_a_slow_browser(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_little_that_is_old_is_on_its_way_to_a_slow_browser(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(server, "PACE_S", 0.001)
     scan = {"seq": 1, "t_mono": 1.0, "bearing_first": 0.0, "bearing_step": 0.01, "ranges": bytes(40_000)}
     told = msgspec.convert(scan, Scan)
 
-    async def body(house: House) -> None:
+    async with serving(tmp_path) as house:
         host, port = house.address.removeprefix("http://").split(":")
         reader, writer = await asyncio.open_connection(host, int(port), limit=1 << 14)
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
@@ -254,29 +226,24 @@ def test_little_that_is_old_is_on_its_way_to_a_slow_browser(tmp_path: Path, monk
         assert 80_000 < came < 1_500_000
         writer.close()
 
-    run(tmp_path, body)
 
-
-def test_what_cannot_be_shown_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_cannot_be_shown_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "TRY_AGAIN_S", 0.01)
 
-    async def body(house: House) -> None:
-        async with house.page() as page:
-            await page.welcome()
-            monkeypatch.setattr(house.view.hub, "take", lambda data: 1 / 0)
-            house.stream.publish(snapshot(1))
-            await page.until("daemon", lambda told: "could not be shown" in told["why"])
-            monkeypatch.undo()
-            await page.until("daemon", lambda told: told["up"])
-            await until(lambda: house.stream.wanted("pose"))
-            house.stream.publish(snapshot(2))
-            await page.until("pose")
-
-    run(tmp_path, body)
+    async with serving(tmp_path) as house, house.page() as page:
+        await page.welcome()
+        monkeypatch.setattr(house.view.hub, "take", lambda data: 1 / 0)
+        house.stream.publish(snapshot(1))
+        await page.until("daemon", lambda told: "could not be shown" in told["why"])
+        monkeypatch.undo()
+        await page.until("daemon", lambda told: told["up"])
+        await until(lambda: house.stream.wanted("pose"))
+        house.stream.publish(snapshot(2))
+        await page.until("pose")
 
 
-def test_a_newcomer_gets_every_tile(tmp_path: Path) -> None:
-    async def body(house: House) -> None:
+async def test_a_newcomer_gets_every_tile(tmp_path: Path) -> None:
+    async with serving(tmp_path) as house:
         hub = house.view.hub
         about = {"map_id": 1, "resolution": 0.05, "side": 128, "unit": 0.1}
         tiles = [(column, 0, bytes(50_000)) for column in range(5)]
@@ -289,37 +256,29 @@ def test_a_newcomer_gets_every_tile(tmp_path: Path) -> None:
                 assert told["resolution"] == 0.05
                 seen |= {tile[0] for tile in told["tiles"]}
 
-    run(tmp_path, body)
+
+async def test_a_newcomer_after_many_loops_is_told_how_things_stand(tmp_path: Path) -> None:
+    hub, viewer = viewers.Hub(), viewers.Viewer(1)
+    for number in range(2 * viewers.KEPT):
+        hub.distribute(Loop(t_mono=float(number), counter=number))
+    hub.disconnected("nobody listens there")
+    hub.welcome(viewer)
+    message = viewer.next_message()
+    assert message is not None
+    told = msgspec.msgpack.decode(message)
+    assert [one["topic"] for one in told] == ["daemon", "history", "loops"]  # no loop that happens now
+    assert not told[0]["data"]["up"]
+    assert [one["counter"] for one in told[2]["data"]][-1] == 2 * viewers.KEPT - 1
+    hub.distribute(Loop(t_mono=1e3, counter=1000))
+    message = viewer.next_message()
+    assert message is not None
+    assert [one["topic"] for one in msgspec.msgpack.decode(message)] == ["loop"]
 
 
-def test_a_newcomer_after_many_loops_is_told_how_things_stand(tmp_path: Path) -> None:
-    async def body() -> None:
-        hub, viewer = viewers.Hub(), viewers.Viewer(1)
-        for number in range(2 * viewers.KEPT):
-            hub.distribute(Loop(t_mono=float(number), counter=number))
-        hub.disconnected("nobody listens there")
-        hub.welcome(viewer)
-        message = viewer.next_message()
-        assert message is not None
-        told = msgspec.msgpack.decode(message)
-        assert [one["topic"] for one in told] == ["daemon", "history", "loops"]  # no loop that happens now
-        assert not told[0]["data"]["up"]
-        assert [one["counter"] for one in told[2]["data"]][-1] == 2 * viewers.KEPT - 1
-        hub.distribute(Loop(t_mono=1e3, counter=1000))
-        message = viewer.next_message()
-        assert message is not None
-        assert [one["topic"] for one in msgspec.msgpack.decode(message)] == ["loop"]
-
-    asyncio.run(body())
-
-
-def test_the_state_is_told_once_each(tmp_path: Path) -> None:
-    async def body(house: House) -> None:
-        async with house.page() as page:
-            await page.welcome()
-            for number, state in enumerate((State.MAPPING, State.MAPPING, State.TRACKING)):
-                house.stream.publish(snapshot(number, state=state))
-            assert (await page.until("state"))["state_name"] == "MAPPING"
-            assert (await page.until("state"))["state_name"] == "TRACKING"
-
-    run(tmp_path, body)
+async def test_the_state_is_told_once_each(tmp_path: Path) -> None:
+    async with serving(tmp_path) as house, house.page() as page:
+        await page.welcome()
+        for number, state in enumerate((State.MAPPING, State.MAPPING, State.TRACKING)):
+            house.stream.publish(snapshot(number, state=state))
+        assert (await page.until("state"))["state_name"] == "MAPPING"
+        assert (await page.until("state"))["state_name"] == "TRACKING"

@@ -18,7 +18,6 @@ from taps.view.orders import Orders
 from tests.daemon.publish.network import publishing
 from tests.daemon.publish.stream.test_server import until
 from tests.taps.view.house import TOKEN, House, Page, serving
-from tests.taps.view.test_server import run
 
 
 async def order(page: Page, name: str, **other: object) -> None:
@@ -171,11 +170,8 @@ def test_a_daemon_that_takes_no_orders_says_so(tmp_path: Path) -> None:
     ordering(tmp_path, body, write=False)
 
 
-def test_a_daemon_without_modbus_takes_no_orders(tmp_path: Path) -> None:
-    async def body(house: House) -> None:
-        async with house.page(TOKEN) as page:
-            await page.welcome()
-            await order(page, "save_map")
-            assert "modbus.port" in (await page.until("order"))["outcome"]
-
-    run(tmp_path, body, guard=Guard("127.0.0.1", TOKEN, True))
+async def test_a_daemon_without_modbus_takes_no_orders(tmp_path: Path) -> None:
+    async with serving(tmp_path, guard=Guard("127.0.0.1", TOKEN, True)) as house, house.page(TOKEN) as page:
+        await page.welcome()
+        await order(page, "save_map")
+        assert "modbus.port" in (await page.until("order"))["outcome"]

@@ -1,4 +1,4 @@
-"""The demo judges honestly, runs end to end, and leaves nothing behind."""
+"""The demo: its verdict, a run from end to end, an interrupted run, and a daemon that dies."""
 
 from __future__ import annotations
 
@@ -18,13 +18,10 @@ from typing import Any
 
 import pytest
 
-from daemon.health.reasons import Reason
 from daemon.snapshot import State
 from tests.rotation import share
-from tools.demo.acts import ROBOT, Act, OrderRefused, Stage, complaint, programme
-from tools.demo.run import free_port, line, links, write_config
-from tools.demo.score import Score, Track, cause, in_map, summary, verdict
-from tools.sim.robot import Body
+from tools.demo.acts import Stage, complaint, programme
+from tools.demo.score import Score, Track, in_map, summary, verdict
 
 
 def reading(state: State = State.TRACKING, pose: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Any:
@@ -40,27 +37,6 @@ def test_truth_is_turned_into_the_map() -> None:
     origin = ((0.0, 0.0, 0.0), (1.0, 2.0, math.pi / 2))
     seen = in_map((1.0, 5.0, math.pi / 2), origin)
     assert seen == pytest.approx((3.0, 0.0, 0.0), abs=1e-12)
-
-
-def test_errors_are_measured_from_the_first_pose() -> None:
-    score = Score()
-    score.take(reading(pose=(0.1, 0.0, 0.0)), (5.0, 5.0, 0.0))
-    score.take(reading(pose=(1.1, 0.3, 0.02)), (6.0, 5.0, 0.0))
-    assert score.error_m == pytest.approx([0.0, 0.3])
-    assert score.error_rad == pytest.approx([0.0, 0.02])
-    assert score.driven_m == pytest.approx(1.0)
-    score.take(reading(State.LOST, pose=(9.1, 0.0, 0.0)), (6.0, 5.0, 0.0))  # in the air, and says so
-    assert max(score.error_m) == pytest.approx(8.0)
-    assert summary(score)["error_while_tracking_m"] == pytest.approx(0.3)
-
-
-def test_a_reading_without_pose_or_truth_is_not_compared() -> None:
-    score = Score()
-    score.take(reading(State.NO_LIDAR, None), (0.0, 0.0, 0.0))
-    score.take(reading(), None)
-    assert (score.error_m, score.reads) == ([], 2)
-    score.trip_s.append(0.001)
-    assert "no pose yet" in line(1.0, Score(reads=1, last=reading(State.NO_LIDAR, None), trip_s=[0.001]), 20.0)
 
 
 def test_truth_is_interpolated_and_never_guessed() -> None:
@@ -91,37 +67,6 @@ def test_verdict(state: State, off: float, complaint: str) -> None:
     for _ in range(4):
         score.take(reading(state, (off, 0.0, 0.0)), (0.0, 0.0, 0.0))
     assert verdict(summary(score)) == complaint or (complaint and complaint in verdict(summary(score)))
-
-
-def test_a_computer_that_is_too_slow_is_named_beside_what_went_wrong() -> None:
-    score = Score(surveyed=True)
-    for k in range(10):
-        score.take(
-            {**reading(State.DEGRADED), "reason": int(Reason.OVERLOADED if k < 2 else Reason.LIDAR_SILENT)}, None
-        )
-    score.take(reading(State.MAPPING), None)
-    figures = summary(score)
-    assert (
-        verdict(figures) == "no pose could be compared with the truth, the states were {'DEGRADED': 10, 'MAPPING': 1}"
-    )
-    assert cause(figures) == "; the computer was too slow for 18 % of it: end other programs"
-    assert cause(summary(Score())) == ""
-
-
-def test_verdict_on_nothing() -> None:
-    assert "nothing was read" in verdict(summary(Score()))
-
-
-def test_configuration_is_good_and_mounts_the_lidar_where_the_robot_has_it(tmp_path: Path) -> None:
-    from daemon.config.loader import load
-
-    settings = load(write_config(tmp_path, free_port(), free_port()))
-    assert settings.bind == "127.0.0.1"
-    assert (settings.lidar.mount.x, settings.lidar.mount.y, settings.lidar.mount.yaw) == Body().lidar
-    assert settings.modbus.port != settings.odometry.port
-    assert settings.photodiode.bus == f"unix:{tmp_path / 'i2c'}"
-    dark = load(write_config(tmp_path, free_port(), free_port(), lights=False))
-    assert not dark.photodiode.fitted
 
 
 @contextlib.contextmanager
@@ -166,52 +111,6 @@ def test_the_programme_switches_each_sensor_off_and_on_and_notes_what_became_of_
     assert "has not become TRACKING" in complaint(acts)
 
 
-@pytest.mark.parametrize(
-    ("states", "words"),
-    [
-        ("TTDDDTT", "photodiode off: TRACKING lost after 1.0 s; on again: TRACKING after 1.0 s"),
-        ("RRRRRRT", "photodiode off: the state was not TRACKING before; on again: TRACKING after 2.0 s"),
-        ("RRTTDDD", "photodiode off: the state was not TRACKING before; on again: not TRACKING since"),
-        ("TTTTTTT", "photodiode off: TRACKING was not lost"),
-        ("TTDD", "photodiode off: TRACKING lost after 1.0 s; not on again by the end"),
-        ("T", "photodiode off: it did not come to that"),
-    ],
-)
-def test_it_is_told_what_became_of_tracking_and_not_that_what_was_not_there_was_lost(
-    tmp_path: Path, states: str, words: str
-) -> None:
-    """Off from the second instant to the fifth, a second apart each."""
-    meant = {"T": State.TRACKING, "D": State.DEGRADED, "R": State.RELOCATING}
-    [act] = acts = [Act("adc", 1.0, 4.0)]
-    with simulator(tmp_path / "control", "ok"):
-        stage = Stage(tmp_path / "control", acts)
-        for t, letter in enumerate(states):
-            stage.play(float(t), int(meant[letter]))
-    assert act.words == words
-    assert bool(complaint(acts)) == (act.state == "on again" and ("since" in words or "was not lost" in words))
-
-
-def test_a_robot_that_did_not_know_its_place_does_not_lose_it_in_the_air(tmp_path: Path) -> None:
-    [act] = acts = [Act(ROBOT, 1.0, 3.0)]
-    with simulator(tmp_path / "control", "ok"):
-        stage = Stage(tmp_path / "control", acts)
-        for t, letter in enumerate("RRRRRT"):
-            stage.play(float(t), int(State.TRACKING if letter == "T" else State.RELOCATING), 0.04)
-    assert act.words == (
-        "robot lifted: the state was not TRACKING before; put down: pose right after 0.0 s, TRACKING after 2.0 s"
-    )
-    assert complaint(acts) == ""
-
-
-def test_a_key_switches_a_sensor_off_and_the_same_key_on_again(tmp_path: Path) -> None:
-    with simulator(tmp_path / "control", "ok") as orders:
-        stage = Stage(tmp_path / "control")
-        for t, key in ((1.0, "x"), (2.0, "l"), (3.0, ""), (4.0, "l")):
-            stage.press(key, t)
-            stage.play(t, int(State.TRACKING))
-    assert orders == ["order off where=lidar", "clear off lidar"]
-
-
 def test_a_robot_is_carried_away_and_watched_until_it_is_found(tmp_path: Path) -> None:
     [act] = programme(60.0, kidnap=True)
     tracking, lost = int(State.TRACKING), int(State.LOST)
@@ -235,40 +134,6 @@ def test_a_robot_is_carried_away_and_watched_until_it_is_found(tmp_path: Path) -
     assert "not become TRACKING" in complaint([act])
     act.seen = None
     assert "stayed TRACKING" in complaint([act])
-
-
-def test_a_key_carries_the_robot_away_once_at_a_time(tmp_path: Path) -> None:
-    with simulator(tmp_path / "control", "ok") as orders:
-        stage = Stage(tmp_path / "control")
-        for t in (1.0, 1.5):
-            stage.press("c", t)
-            stage.play(t, int(State.TRACKING))
-    assert orders == ["order carry where=robot ahead=32 takes=2"]
-
-
-def test_a_simulator_that_refuses_or_is_gone_is_told_plainly(tmp_path: Path) -> None:
-    stage = Stage(tmp_path / "control", programme(60.0))
-    with pytest.raises(OrderRefused, match="does not take orders"):
-        stage.play(59.0, int(State.TRACKING))
-    with simulator(tmp_path / "control", "refused: no such word"), pytest.raises(OrderRefused, match="no such word"):
-        stage.play(59.0, int(State.TRACKING))
-
-
-def test_links_are_shown_with_lamp_and_strength() -> None:
-    lit = {"light_fix": 2, "light_used": 2, "links": 3, "light_age": 0.1}
-    lit |= {"link_1_lamp": 7, "link_1_strength": 1.25e-6, "link_2_lamp": None, "link_2_strength": 1e-6}
-    lit |= {"link_3_lamp": 9, "link_3_strength": 2e-7, "link_4_lamp": None, "link_4_strength": None}
-    assert links(lit) == " 2 of  3 used  7:1.250  9:0.200"
-    assert links({**lit, "light_age": 3.0}) == links({**lit, "links": 0}) == "no light"
-    assert links({"links": None}) == "no photodiode"
-
-
-def test_in_a_survey_errors_are_absolute_and_count_from_the_first_tracking() -> None:
-    score = Score(surveyed=True)
-    score.take(reading(State.RELOCATING, (9.0, 0.0, 0.0)), (5.0, 5.0, 0.0))
-    assert score.error_m == []
-    score.take(reading(pose=(5.0, 5.3, 0.0)), (5.0, 5.0, 0.0))
-    assert score.error_m == pytest.approx([0.3])
 
 
 def left_behind(mark: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""The experiment on static grids: its locator is right, nothing leaks between halves, and it reaches its numbers."""
+"""The experiment on static grids: halves stay separate, and real places reach the stated numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import pytest
 
 from estimator.light_filter.lambertian import expected
 from tools.experiments import static
-from tools.experiments.static import Taught
 from tools.experiments.vlp import STATIC_LAMPS, Campaign
 
 
@@ -23,13 +22,6 @@ def artificial() -> Campaign:
     survey = static.nominal(data)
     rss = [expected(survey.lamps, survey, np.array((p[0], p[1], 0.0))).amplitude for p in places]
     return replace(data, rss=1e6 * np.array(rss))
-
-
-def test_the_locator_finds_places_from_nothing(artificial: Campaign) -> None:
-    taught = Taught(static.nominal(artificial), None, 0.02)
-    everywhere = np.arange(0, 49, 5)
-    found = static.errors(taught, artificial, everywhere, 1e-6)
-    assert found.max() < 0.01
 
 
 def test_nothing_leaks_between_halves(artificial: Campaign) -> None:
@@ -46,15 +38,6 @@ def test_nothing_leaks_between_halves(artificial: Campaign) -> None:
     assert np.array_equal(one.residuals.mean, other.residuals.mean)
     assert np.array_equal(one.residuals.sigma, other.residuals.sigma)
     assert one.residuals.noise == other.residuals.noise
-
-
-def test_the_ten_places_follow_from_coordinates_alone(artificial: Campaign) -> None:
-    ten = static.named(artificial)
-    assert len(set(ten.tolist())) == 10
-    assert np.array_equal(ten, static.named(replace(artificial, rss=artificial.rss[::-1])))
-    assert artificial.places[ten[0], :2] == pytest.approx((2.5, 2.5))
-    corners = {tuple(artificial.places[i, :2].round(1)) for i in ten[1:5]}
-    assert corners == {(0.4, 0.4), (0.4, 4.6), (4.6, 0.4), (4.6, 4.6)}
 
 
 @pytest.mark.slow

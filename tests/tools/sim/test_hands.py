@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hal.fake.faults.orders import FaultError, read_fault
-from hal.fake.lidar.models import UTM_30LX
-from tools.sim.hands import VOCABULARY, Hands, Way, start_of, then
+from tools.sim.hands import Way
 from tools.sim.odometry import Wheels
 from tools.sim.robot import Body, Drive, Route
 from tools.sim.scene import Scenario, SimulatedScene
@@ -26,11 +24,6 @@ def test_the_drive_stands_still_in_the_air_and_goes_on_further_along() -> None:
     assert there[0] == pytest.approx(begin, abs=1e-4)
     assert there[1, :2] == pytest.approx(0.5 * (begin + end)[:2])
     assert there[2] == pytest.approx(end)
-
-
-def test_frames_are_put_in_a_row_and_taken_apart() -> None:
-    frame, pose = np.array((1.0, 2.0, 0.7)), np.array((0.3, -0.4, 4.0))
-    assert start_of(then(frame, pose), pose) == pytest.approx(frame)
 
 
 def test_wheels_count_nothing_of_being_carried() -> None:
@@ -52,24 +45,3 @@ def test_wheels_count_nothing_of_being_carried() -> None:
     moved = np.hypot(*(later - down)[:2])
     assert moved > 0.5
     assert np.hypot(*(readings[14.0] - readings[12.0])[:2]) == pytest.approx(moved, abs=5e-3)
-
-
-def test_an_order_for_the_robot_needs_no_address() -> None:
-    scene = SimulatedScene(Scenario(people=False))
-    scene.begin(0.0)
-    words = {"robot": VOCABULARY, "lidar": {}}
-    fault = read_fault({"what": "carry", "ahead": 30}, "order", words)
-    hands = Hands(scene, lambda: 5.0)
-    hands.begin(fault)
-    assert float(scene.driven(np.array([8.0]))[0]) == pytest.approx(36.0)
-    assert hands.in_force() == []
-    with pytest.raises(FaultError, match=r"order\.ahead"):
-        read_fault({"what": "carry", "ahead": -1.0}, "order", words)
-
-
-def test_a_robot_that_has_not_driven_off_is_not_carried() -> None:
-    scene = SimulatedScene(Scenario(people=False, lidar="UTM-30LX"), held=True)
-    scene.begin(0.0)
-    scene.carry(1.0, 30.0, 1.0)
-    assert scene.truth(np.array([5.0]))[0] == pytest.approx(scene.truth(np.array([0.0]))[0])
-    assert scene.model is UTM_30LX

@@ -1,27 +1,16 @@
-"""The block of integrity and the end of the datagram: places, units, what is not known, and the frozen contract."""
+"""The block of integrity and the end of the datagram: places, units, and what is not known."""
 
 from __future__ import annotations
 
-import json
 import struct
 import zlib
-from functools import partial
-from pathlib import Path
-from typing import Any
-
-import pytest
 
 import estimator.result
 from daemon.cli import status_table
-from daemon.publish import document
-from daemon.publish.modbus import integrity_block, lights_block, registers
-from daemon.publish.modbus.requests import Responder
+from daemon.publish.modbus import integrity_block, registers
 from daemon.runtime.snapshot_builder import LOOPS
 from daemon.snapshot import LoopReason, Trust
-from tests.daemon.publish.modbus.test_lights_block import ask, layout
 from tests.daemon.publish.modbus.test_registers import snapshot
-
-FROZEN = Path(__file__).parent / "frozen" / f"integrity_v{integrity_block.BLOCK.version}.json"
 
 TRUST = Trust(0.12301, 0.0351, 0.5, True, laser=True, wheels=True, gap=6.25, places=3)
 
@@ -79,29 +68,6 @@ def test_a_datagram_of_a_program_that_knew_no_bound_is_read() -> None:
     assert "protection" not in reading
 
 
-@pytest.mark.parametrize(
-    ("at", "word", "words"), [(0, 0x4C4C, "magic"), (1, 2, "version 2"), (3, 1, "torn"), (13, 1, "torn")]
-)
-def test_a_block_that_is_not_ours_is_refused(at: int, word: int, words: str) -> None:
-    block = bytearray(integrity_block.BLOCK.encode(snapshot()))
-    block[2 * at : 2 * at + 2] = word.to_bytes(2, "big")
-    with pytest.raises(ValueError, match=words):
-        integrity_block.BLOCK.decode(bytes(block))
-    with pytest.raises(ValueError, match="14 registers, got 4"):
-        integrity_block.BLOCK.decode(bytes(8))
-
-
-@pytest.mark.parametrize("function", [3, 4])
-def test_clients_read_all_of_it_or_a_part(function: int) -> None:
-    responder, taken = Responder(), snapshot(trust=TRUST)
-    encoders = (registers.encode_mirror, lights_block.BLOCK.encode, integrity_block.BLOCK.encode)
-    responder.show(registers.encode_block(taken), *[partial(encode, taken) for encode in encoders])
-    assert ask(responder, 340, 14, function)[9:] == integrity_block.BLOCK.encode(taken)
-    assert ask(responder, 344, 2, function)[9:] == integrity_block.BLOCK.encode(taken)[8:12]
-    for address, count in ((339, 2), (340, 15)):
-        assert ask(responder, address, count, function)[7:] == bytes([function | 0x80, 2])
-
-
 def test_status_shows_the_bound() -> None:
     taken = snapshot(trust=TRUST, loop_residual=0.0123)
     reading = registers.decode_block(registers.encode_block(taken))
@@ -114,35 +80,3 @@ def test_status_shows_the_bound() -> None:
     reading = registers.decode_block(registers.encode_block(snapshot()))
     reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(snapshot()))
     assert "bound      none" in status_table.as_table(reading, stalled=False)
-
-
-def contract() -> dict[str, Any]:
-    return {
-        "version": integrity_block.BLOCK.version,
-        "magic": integrity_block.BLOCK.magic,
-        "address": integrity_block.BLOCK.address,
-        "registers": integrity_block.BLOCK.registers,
-        "datagram_from": registers.TRUST_OFFSET,
-        "block": layout(integrity_block.BLOCK),
-        "tail": layout(integrity_block.TAIL),
-        "witnesses": [name for name, _, _ in integrity_block.WITNESSES],
-        "reasons": {why.name: why.value for why in LoopReason},
-    }
-
-
-def test_the_contract_is_the_frozen_one() -> None:
-    """A published layout is never edited: bits and reasons may be appended, anything else needs a new version."""
-    frozen, now = json.loads(FROZEN.read_text()), contract()
-    reasons = frozen.pop("reasons")
-    assert {name: now["reasons"].get(name) for name in reasons} == reasons
-    now.pop("reasons")
-    assert now.pop("witnesses")[: len(frozen["witnesses"])] == frozen.pop("witnesses")
-    assert now == frozen
-
-
-def test_the_pages_say_where_everything_is() -> None:
-    modbus, udp = document.modbus_page(), document.udp_page()
-    for offset, point in zip(integrity_block.BLOCK.offsets, integrity_block.BLOCK.points, strict=True):
-        assert f"| {342 + offset} | `{point.name}` | {point.wire.name} |" in modbus
-    for offset, point in zip(integrity_block.TAIL.offsets, integrity_block.TAIL.points, strict=True):
-        assert f"| {152 + 2 * offset} | `{point.name}` | {point.wire.name} |" in udp

@@ -1,26 +1,18 @@
-"""The block of lights and the end of the datagram: places, units, what is not known, and the frozen contract."""
+"""The block of lights and the end of the datagram: places, units, and what is not known."""
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 import zlib
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from daemon.publish import document
 from daemon.publish.modbus import lights_block, registers
-from daemon.publish.modbus.points import Layout
-from daemon.publish.modbus.requests import Responder
-from daemon.snapshot import LightFix, LightLink, LightPicture, LinkUse, Snapshot
+from daemon.snapshot import LightFix, LightLink, LightPicture, LinkUse
 from estimator.result import Fix, LinkState
 from tests.daemon.publish.modbus.test_registers import snapshot
-
-FROZEN = Path(__file__).parent / "frozen" / f"lights_v{lights_block.BLOCK.version}.json"
 
 LINKS = (
     LightLink(17, 1017, LinkUse.ACCEPTED, 1.25e-6, -0.031),
@@ -93,21 +85,6 @@ def test_only_the_strongest_sixteen_are_shown() -> None:
     assert [reading[f"link_{row}_code"] for row in range(1, 17)] == list(range(16))
 
 
-@pytest.mark.parametrize(
-    ("at", "word", "words"), [(0, 0x4C4C, "magic"), (1, 2, "version 2"), (3, 1, "torn"), (119, 1, "torn")]
-)
-def test_a_block_that_is_not_ours_is_refused(at: int, word: int, words: str) -> None:
-    block = bytearray(lights_block.BLOCK.encode(snapshot(light=picture())))
-    block[2 * at : 2 * at + 2] = word.to_bytes(2, "big")
-    with pytest.raises(ValueError, match=words):
-        lights_block.BLOCK.decode(bytes(block))
-
-
-def test_the_wrong_size_is_refused() -> None:
-    with pytest.raises(ValueError, match="120 registers, got 64"):
-        lights_block.BLOCK.decode(bytes(128))
-
-
 def test_the_end_of_the_datagram_by_hand() -> None:
     data = registers.encode_datagram(snapshot(light=picture()))
     assert len(data) == 172
@@ -123,76 +100,3 @@ def test_a_datagram_of_a_program_that_knew_no_lights_is_read() -> None:
     reading = registers.decode_datagram(shorter)
     assert reading["map_x"] == 1.2345
     assert "light_x" not in reading
-
-
-def ask(responder: Responder, address: int, count: int, function: int = 4) -> bytes:
-    return responder.answer(struct.pack(">HHHBBHH", 7, 0, 6, 1, function, address, count))
-
-
-@pytest.mark.parametrize("function", [3, 4])
-def test_clients_read_all_of_it_or_a_part(function: int) -> None:
-    responder, taken = Responder(), snapshot(light=picture())
-    made: list[Snapshot] = []
-
-    def make() -> bytes:
-        made.append(taken)
-        return lights_block.BLOCK.encode(taken)
-
-    responder.show(registers.encode_block(taken), partial(registers.encode_mirror, taken), make)
-    assert ask(responder, 0, 64, function)[9:] == registers.encode_block(taken)
-    assert not made, "nobody has asked for the lights"
-    assert ask(responder, 200, 120, function)[9:] == lights_block.BLOCK.encode(taken)
-    assert ask(responder, 222, 6, function)[9:] == lights_block.BLOCK.encode(taken)[44:56]
-    assert len(made) == 1, "made once a snapshot, however often it is read"
-    for address, count in ((199, 2), (200, 121), (320, 1), (319, 2)):
-        assert ask(responder, address, count, function)[7:] == bytes([function | 0x80, 2])
-
-
-def layout(points: Layout) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": p.name, "offset": offset, "type": p.wire.name, "per_unit": p.per_unit, "unit": p.unit,
-            "rule": p.rule.value, "not_known": p.wire.not_known if p.can_be_unknown else None,
-        }
-        for offset, p in zip(points.offsets, points.points, strict=True)
-    ]  # fmt: skip
-
-
-def contract() -> dict[str, Any]:
-    return {
-        "version": lights_block.BLOCK.version,
-        "magic": lights_block.BLOCK.magic,
-        "address": lights_block.BLOCK.address,
-        "registers": lights_block.BLOCK.registers,
-        "datagram_from": registers.TAIL_OFFSET,
-        "block": layout(lights_block.BLOCK),
-        "tail": layout(lights_block.TAIL),
-        "fixes": {fix.name: fix.value for fix in LightFix},
-        "uses": {use.name: use.value for use in LinkUse},
-    }
-
-
-def test_the_contract_is_the_frozen_one() -> None:
-    """A published layout is never edited: fixes and uses may be appended, anything else needs a new version."""
-    frozen, now = json.loads(FROZEN.read_text()), contract()
-    for key in ("fixes", "uses"):
-        before = frozen.pop(key)
-        assert {name: now[key].get(name) for name in before} == before
-        now.pop(key)
-    assert now == frozen
-
-
-def test_the_pages_say_where_everything_is() -> None:
-    modbus, udp = document.modbus_page(), document.udp_page()
-    for offset, point in zip(lights_block.BLOCK.offsets, lights_block.BLOCK.points, strict=True):
-        if not point.name.startswith("link_") or point.name.startswith("link_1_"):
-            assert f"| {202 + offset} | `{point.name}` | {point.wire.name} |" in modbus
-    assert (
-        lights_block.BLOCK.offsets[
-            lights_block.BLOCK.points.index(next(p for p in lights_block.BLOCK.points if p.name == "link_3_code"))
-        ]
-        == 222 - 202 + 12
-    )
-    assert "begins at 222 + 6 (k - 1)" in modbus
-    for offset, point in zip(lights_block.TAIL.offsets, lights_block.TAIL.points, strict=True):
-        assert f"| {128 + 2 * offset} | `{point.name}` | {point.wire.name} |" in udp

@@ -20,7 +20,7 @@ from daemon.config.endpoints import RtuLine
 from daemon.publish.modbus import registers, rtu
 from daemon.publish.modbus.rtu import RtuServer
 from daemon.publish.modbus.server import ModbusPublisher
-from hal.clock import LoopClock, SystemClock, run_virtual
+from hal.clock import LoopClock, SystemClock
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.port.port import MemoryPort, memory_pair
 from tests.daemon.publish.modbus.test_registers import snapshot
@@ -84,18 +84,15 @@ async def answer(ours: int, size: int) -> bytes:
     return got
 
 
-def test_a_block_over_a_pseudo_terminal() -> None:
-    async def run() -> None:
-        async with line() as (ours, _, server, _):
-            block = registers.encode_block(snapshot())
-            for _ in range(5):
-                os.write(ours, asked())
-                assert await answer(ours, 133) == asked(b"\x04\x80" + block)
-            os.write(ours, asked(b"\x2b\x0e\x01\x00"))
-            assert await answer(ours, 5) == asked(b"\xab\x01"), "an exception for what is not served"
-            assert (server.requests, server.unsent) == (6, 0)
-
-    asyncio.run(run())
+async def test_a_block_over_a_pseudo_terminal() -> None:
+    async with line() as (ours, _, server, _):
+        block = registers.encode_block(snapshot())
+        for _ in range(5):
+            os.write(ours, asked())
+            assert await answer(ours, 133) == asked(b"\x04\x80" + block)
+        os.write(ours, asked(b"\x2b\x0e\x01\x00"))
+        assert await answer(ours, 5) == asked(b"\xab\x01"), "an exception for what is not served"
+        assert (server.requests, server.unsent) == (6, 0)
 
 
 def test_the_reference_client_reads_the_line() -> None:
@@ -174,147 +171,130 @@ class Line:
             self.master.write(data)
 
 
-def test_an_answer_waits_until_the_master_has_let_the_line_go() -> None:
-    async def run() -> None:
-        at = Line()
-        running = asyncio.create_task(at.server.run())
+@pytest.mark.virtual
+async def test_an_answer_waits_until_the_master_has_let_the_line_go() -> None:
+    at = Line()
+    running = asyncio.create_task(at.server.run())
+    await asyncio.sleep(1.0)
+    at.master.write(asked())
+    await asyncio.sleep(1.0)
+    ((t, data),) = at.heard
+    assert t == pytest.approx(1.0 + 3.5 * 11 / 9600, abs=1e-6)
+    assert data == asked()
+    at.master.write(asked(unit=0))
+    await asyncio.sleep(1.0)
+    assert len(at.heard) == 1, "what is for all is not answered"
+    assert len(at.asked) == 2
+    running.cancel()
+
+
+@pytest.mark.virtual
+async def test_an_adapter_that_sends_our_answer_back() -> None:
+    at = Line(echo=True)
+    running = asyncio.create_task(at.server.run())
+    await asyncio.sleep(0)
+    write = b"\x06\x03\xe8\x00\x01"
+    for number in (1, 2):
+        at.master.write(asked(write))
         await asyncio.sleep(1.0)
-        at.master.write(asked())
-        await asyncio.sleep(1.0)
-        ((t, data),) = at.heard
-        assert t == pytest.approx(1.0 + 3.5 * 11 / 9600, abs=1e-6)
-        assert data == asked()
-        at.master.write(asked(unit=0))
-        await asyncio.sleep(1.0)
-        assert len(at.heard) == 1, "what is for all is not answered"
-        assert len(at.asked) == 2
-        running.cancel()
-
-    run_virtual(run())
+        assert len(at.asked) == number, "the echo is no request, the master's repetition is one"
+    running.cancel()
 
 
-def test_an_adapter_that_sends_our_answer_back() -> None:
-    async def run() -> None:
-        at = Line(echo=True)
-        running = asyncio.create_task(at.server.run())
-        await asyncio.sleep(0)
-        write = b"\x06\x03\xe8\x00\x01"
-        for number in (1, 2):
-            at.master.write(asked(write))
-            await asyncio.sleep(1.0)
-            assert len(at.asked) == number, "the echo is no request, the master's repetition is one"
-        running.cancel()
-
-    run_virtual(run())
-
-
-def test_half_a_request_is_forgotten_when_the_line_falls_silent() -> None:
-    async def run() -> None:
-        at = Line()
-        running = asyncio.create_task(at.server.run())
-        await asyncio.sleep(0)
-        at.master.write(asked()[:5])
-        await asyncio.sleep(2 * rtu.SILENCE_S)
-        at.master.write(asked()[5:])
-        await asyncio.sleep(1.0)
-        assert at.asked == []
-        at.master.write(asked())
-        await asyncio.sleep(1.0)
-        assert at.asked == [READ]
-        running.cancel()
-
-    run_virtual(run())
+@pytest.mark.virtual
+async def test_half_a_request_is_forgotten_when_the_line_falls_silent() -> None:
+    at = Line()
+    running = asyncio.create_task(at.server.run())
+    await asyncio.sleep(0)
+    at.master.write(asked()[:5])
+    await asyncio.sleep(2 * rtu.SILENCE_S)
+    at.master.write(asked()[5:])
+    await asyncio.sleep(1.0)
+    assert at.asked == []
+    at.master.write(asked())
+    await asyncio.sleep(1.0)
+    assert at.asked == [READ]
+    running.cancel()
 
 
-def test_an_answer_for_which_the_master_waits_no_longer_is_not_sent() -> None:
+@pytest.mark.virtual
+async def test_an_answer_for_which_the_master_waits_no_longer_is_not_sent() -> None:
     """Its next request begins within the pause before the answer: what was sent then would collide with it."""
-
-    async def run() -> None:
-        at = Line()
-        running = asyncio.create_task(at.server.run())
-        await asyncio.sleep(1.0)
-        for first in (asked(), asked() + b"\x00"):  # and a stray byte where the direction changes
-            at.heard.clear()
-            at.master.write(first)
-            await asyncio.sleep(0.002)
-            at.master.write(asked(b"\x07")[:3])
-            await asyncio.sleep(0.02)
-            assert at.heard == []
-            at.master.write(asked(b"\x07")[3:])
-            await asyncio.sleep(1.0)
-            assert [data for _, data in at.heard] == [asked(b"\x07")]
-        assert at.server.late == 2
-        at.master.write(asked())
+    at = Line()
+    running = asyncio.create_task(at.server.run())
+    await asyncio.sleep(1.0)
+    for first in (asked(), asked() + b"\x00"):  # and a stray byte where the direction changes
+        at.heard.clear()
+        at.master.write(first)
         await asyncio.sleep(0.002)
-        at.master.write(b"\xff")
+        at.master.write(asked(b"\x07")[:3])
+        await asyncio.sleep(0.02)
+        assert at.heard == []
+        at.master.write(asked(b"\x07")[3:])
         await asyncio.sleep(1.0)
-        assert at.heard[-1][1] == asked(), "a stray byte is no request"
-        running.cancel()
-
-    run_virtual(run())
+        assert [data for _, data in at.heard] == [asked(b"\x07")]
+    assert at.server.late == 2
+    at.master.write(asked())
+    await asyncio.sleep(0.002)
+    at.master.write(b"\xff")
+    await asyncio.sleep(1.0)
+    assert at.heard[-1][1] == asked(), "a stray byte is no request"
+    running.cancel()
 
 
 @pytest.mark.realtime
-def test_what_waited_while_the_computer_had_no_time_is_not_answered() -> None:
+async def test_what_waited_while_the_computer_had_no_time_is_not_answered() -> None:
     """On a pseudo-terminal: the loop stands still for longer than a master waits, then goes on as ever."""
-
-    async def run() -> None:
-        async with line(patience_s=rtu.PATIENCE_S) as (ours, _, server, publisher):
-            await asyncio.sleep(2 * rtu.TURN_S)
-            write = struct.pack(">BHHB4H", 16, 1000, 4, 8, 1, 2, 0, 0)  # a RESET that its master has given up
-            os.write(ours, asked(write))
-            time.sleep(rtu.PATIENCE_S + 0.2)  # noqa: ASYNC251 - it is to stand still
-            os.set_blocking(ours, False)
-            await asyncio.sleep(0.1)
-            with pytest.raises(BlockingIOError):
-                os.read(ours, 1)
-            os.set_blocking(ours, True)
-            assert (server.late, server.requests) == (1, 0)
-            assert publisher.answer(struct.pack(">BHH", 3, 1000, 1))[2:] == bytes(2), "it was not carried out, either"
-            os.write(ours, asked())
-            assert len(await answer(ours, 133)) == 133
-
-    asyncio.run(run())
+    async with line(patience_s=rtu.PATIENCE_S) as (ours, _, server, publisher):
+        await asyncio.sleep(2 * rtu.TURN_S)
+        write = struct.pack(">BHHB4H", 16, 1000, 4, 8, 1, 2, 0, 0)  # a RESET that its master has given up
+        os.write(ours, asked(write))
+        time.sleep(rtu.PATIENCE_S + 0.2)  # noqa: ASYNC251 - it is to stand still
+        os.set_blocking(ours, False)
+        await asyncio.sleep(0.1)
+        with pytest.raises(BlockingIOError):
+            os.read(ours, 1)
+        os.set_blocking(ours, True)
+        assert (server.late, server.requests) == (1, 0)
+        assert publisher.answer(struct.pack(">BHH", 3, 1000, 1))[2:] == bytes(2), "it was not carried out, either"
+        os.write(ours, asked())
+        assert len(await answer(ours, 133)) == 133
 
 
-def test_a_line_that_goes_is_told_and_can_be_opened_anew() -> None:
-    async def run() -> None:
-        at = Line()
-        running = asyncio.create_task(at.server.run())
-        await asyncio.sleep(0)
-        at.master.write(asked())
-        await asyncio.sleep(0)
-        at.master.close()
-        with pytest.raises(HalError):
-            await running
-
-    run_virtual(run())
+@pytest.mark.virtual
+async def test_a_line_that_goes_is_told_and_can_be_opened_anew() -> None:
+    at = Line()
+    running = asyncio.create_task(at.server.run())
+    await asyncio.sleep(0)
+    at.master.write(asked())
+    await asyncio.sleep(0)
+    at.master.close()
+    with pytest.raises(HalError):
+        await running
 
 
-def test_a_line_that_takes_no_answers_is_opened_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.virtual
+async def test_a_line_that_takes_no_answers_is_opened_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """A single one is only counted; the supervisor opens again what has raised."""
 
     def full(_: bytes) -> None:
         raise DeviceFault("line", "full")
 
-    async def run() -> None:
-        at = Line()
-        running = asyncio.create_task(at.server.run())
-        await asyncio.sleep(0)
-        for blocked in (True, True, False, True, True):
-            with monkeypatch.context() as patch:
-                if blocked:
-                    patch.setattr(at.slave, "write", full)
-                at.master.write(asked())
-                await asyncio.sleep(1.0)
-        assert (at.server.requests, at.server.unsent, running.done()) == (5, 4, False)
-        monkeypatch.setattr(at.slave, "write", full)
-        at.master.write(asked())
-        await asyncio.sleep(1.0)
-        with pytest.raises(DeviceFault, match="full"):
-            await running
-
-    run_virtual(run())
+    at = Line()
+    running = asyncio.create_task(at.server.run())
+    await asyncio.sleep(0)
+    for blocked in (True, True, False, True, True):
+        with monkeypatch.context() as patch:
+            if blocked:
+                patch.setattr(at.slave, "write", full)
+            at.master.write(asked())
+            await asyncio.sleep(1.0)
+    assert (at.server.requests, at.server.unsent, running.done()) == (5, 4, False)
+    monkeypatch.setattr(at.slave, "write", full)
+    at.master.write(asked())
+    await asyncio.sleep(1.0)
+    with pytest.raises(DeviceFault, match="full"):
+        await running
 
 
 def test_a_line_that_is_not_there_names_the_key() -> None:

@@ -113,47 +113,39 @@ def test_eight_udp_clients_back_to_back() -> None:
     asyncio.run(run())
 
 
-def test_a_burst_of_datagrams_from_eight_clients() -> None:
+async def test_a_burst_of_datagrams_from_eight_clients() -> None:
     """Requests that lie in the socket's queue together: the case in which a shared peer address loses answers."""
-
-    async def run() -> None:
-        async with publishing() as publisher:
-            socks = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(8)]
-            for number, sock in enumerate(socks):
-                sock.setblocking(False)
-                sock.connect(("127.0.0.1", publisher.port))
-                for index in range(20):
-                    sock.send(request(number * 20 + index, *BLOCK))
-            await asyncio.sleep(0.3)
-            for number, sock in enumerate(socks):
-                answers = [sock.recv(512) for _ in range(20)]
-                assert [int.from_bytes(a[:2], "big") for a in answers] == list(range(number * 20, number * 20 + 20))
-                with pytest.raises(BlockingIOError):
-                    sock.recv(512)
-                sock.close()
-
-    asyncio.run(run())
+    async with publishing() as publisher:
+        socks = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(8)]
+        for number, sock in enumerate(socks):
+            sock.setblocking(False)
+            sock.connect(("127.0.0.1", publisher.port))
+            for index in range(20):
+                sock.send(request(number * 20 + index, *BLOCK))
+        await asyncio.sleep(0.3)
+        for number, sock in enumerate(socks):
+            answers = [sock.recv(512) for _ in range(20)]
+            assert [int.from_bytes(a[:2], "big") for a in answers] == list(range(number * 20, number * 20 + 20))
+            with pytest.raises(BlockingIOError):
+                sock.recv(512)
+            sock.close()
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 13, 100_000])
-def test_pipelined_tcp_requests_however_they_are_cut(size: int) -> None:
+async def test_pipelined_tcp_requests_however_they_are_cut(size: int) -> None:
     """500 requests in one go, in segments that end anywhere: all answered, in order."""
-
-    async def run() -> None:
-        async with publishing() as publisher, tcp_client(publisher.port) as (reader, writer):
-            stream = b"".join(request(number, *BLOCK) for number in range(500 if size > 2 else 60))
-            for start in range(0, len(stream), size):
-                writer.write(stream[start : start + size])
-                if size < 100:
-                    await asyncio.sleep(0)
-            for number in range(len(stream) // 12):
-                answer = await read_answer(reader)
-                assert (int.from_bytes(answer[:2], "big"), len(answer)) == (number, 137)
-
-    asyncio.run(run())
+    async with publishing() as publisher, tcp_client(publisher.port) as (reader, writer):
+        stream = b"".join(request(number, *BLOCK) for number in range(500 if size > 2 else 60))
+        for start in range(0, len(stream), size):
+            writer.write(stream[start : start + size])
+            if size < 100:
+                await asyncio.sleep(0)
+        for number in range(len(stream) // 12):
+            answer = await read_answer(reader)
+            assert (int.from_bytes(answer[:2], "big"), len(answer)) == (number, 137)
 
 
-def test_small_answers_are_not_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_small_answers_are_not_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without TCP_NODELAY the second small answer would wait for the client's delayed acknowledgement, 40 ms."""
     delays: list[int] = []
     made = tcp_endpoint.Connection.connection_made
@@ -164,72 +156,57 @@ def test_small_answers_are_not_held_back(monkeypatch: pytest.MonkeyPatch) -> Non
         made(self, transport)
 
     monkeypatch.setattr(tcp_endpoint.Connection, "connection_made", connection_made)
-
-    async def run() -> None:
-        async with publishing() as publisher, tcp_client(publisher.port) as (reader, writer):
-            writer.write(request(1, *BLOCK))
-            await read_answer(reader)
-
-    asyncio.run(run())
+    async with publishing() as publisher, tcp_client(publisher.port) as (reader, writer):
+        writer.write(request(1, *BLOCK))
+        await read_answer(reader)
     assert delays == [1]
 
 
-def test_a_client_that_ends_still_gets_what_it_asked_for() -> None:
-    async def run() -> None:
-        async with publishing() as publisher, tcp_client(publisher.port) as (reader, writer):
-            writer.write(b"".join(request(number, *BLOCK) for number in range(300)))
-            writer.write_eof()
-            assert len(await closed(reader)) == 300 * 137
-
-    asyncio.run(run())
+async def test_a_client_that_ends_still_gets_what_it_asked_for() -> None:
+    async with publishing() as publisher, tcp_client(publisher.port) as (reader, writer):
+        writer.write(b"".join(request(number, *BLOCK) for number in range(300)))
+        writer.write_eof()
+        assert len(await closed(reader)) == 300 * 137
 
 
-def test_one_client_with_thousands_of_requests_delays_nobody() -> None:
+async def test_one_client_with_thousands_of_requests_delays_nobody() -> None:
     """Another client's request is answered while the flood is still being served, and so is one over UDP."""
-
-    async def run() -> None:
-        async with publishing() as publisher, tcp_client(publisher.port) as (_, flood):
-            flood.write(b"".join(request(number & 0xFFFF, *BLOCK) for number in range(1500)))
-            async with tcp_client(publisher.port) as (reader, writer), udp_client(publisher.port) as (udp, datagrams):
-                writer.write(request(7, *BLOCK))
-                udp.sendto(request(8, *BLOCK))
-                await read_answer(reader)
-                await datagrams.wait_for(1)
-                assert publisher.counts.requests < 1400
-
-    asyncio.run(run())
+    async with publishing() as publisher, tcp_client(publisher.port) as (_, flood):
+        flood.write(b"".join(request(number & 0xFFFF, *BLOCK) for number in range(1500)))
+        async with tcp_client(publisher.port) as (reader, writer), udp_client(publisher.port) as (udp, datagrams):
+            writer.write(request(7, *BLOCK))
+            udp.sendto(request(8, *BLOCK))
+            await read_answer(reader)
+            await datagrams.wait_for(1)
+            assert publisher.counts.requests < 1400
 
 
-def test_a_turn_serves_at_most_64_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_turn_serves_at_most_64_requests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every client that may be there sends as much as it can; requests served between two turns are counted."""
     per_turn: list[int] = []
+    async with publishing() as publisher:
+        loop = asyncio.get_running_loop()
+        links = [await asyncio.open_connection("127.0.0.1", publisher.port) for _ in range(counts.MAX_CONNECTIONS)]
+        senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
+        for _, writer in links:
+            writer.write(b"".join(request(n, 4, 0, 1) for n in range(100)))
+        for sock in senders:
+            for n in range(50):
+                sock.sendto(request(n, 4, 0, 1), ("127.0.0.1", publisher.port))
+        before = publisher.counts.requests
 
-    async def run() -> None:
-        async with publishing() as publisher:
-            loop = asyncio.get_running_loop()
-            links = [await asyncio.open_connection("127.0.0.1", publisher.port) for _ in range(counts.MAX_CONNECTIONS)]
-            senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
-            for _, writer in links:
-                writer.write(b"".join(request(n, 4, 0, 1) for n in range(100)))
-            for sock in senders:
-                for n in range(50):
-                    sock.sendto(request(n, 4, 0, 1), ("127.0.0.1", publisher.port))
+        def turn() -> None:
+            nonlocal before
+            per_turn.append(publisher.counts.requests - before)
             before = publisher.counts.requests
+            loop.call_soon(turn)
 
-            def turn() -> None:
-                nonlocal before
-                per_turn.append(publisher.counts.requests - before)
-                before = publisher.counts.requests
-                loop.call_soon(turn)
-
-            turn()
-            await until(lambda: publisher.counts.requests >= counts.MAX_CONNECTIONS * 100 + 4 * 50)
-            for _, writer in links:
-                writer.close()
-            for sock in senders:
-                sock.close()
-
-    asyncio.run(run())
+        turn()
+        await until(lambda: publisher.counts.requests >= counts.MAX_CONNECTIONS * 100 + 4 * 50)
+        for _, writer in links:
+            writer.close()
+        for sock in senders:
+            sock.close()
     assert 0 < max(per_turn) <= 64
 
 

@@ -38,80 +38,68 @@ MALFORMED = [
 ]
 
 
-def test_a_malformed_datagram_disturbs_nobody(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_malformed_datagram_disturbs_nobody(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-
-    async def run() -> None:
-        async with publishing() as publisher, udp_client(publisher.port) as (good, datagrams):
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bad:
-                for number, rubbish in enumerate(MALFORMED * 5):
-                    bad.sendto(rubbish, ("127.0.0.1", publisher.port))
-                    good.sendto(request(number, *BLOCK))
-                    await datagrams.wait_for(number + 1)
-                with pytest.raises(BlockingIOError):
-                    bad.recv(512, socket.MSG_DONTWAIT)
-            assert [a[:2] for a in datagrams.answers] == [n.to_bytes(2, "big") for n in range(len(MALFORMED) * 5)]
-            assert publisher.counts.malformed == len(MALFORMED) * 5
-
-    asyncio.run(run())
+    async with publishing() as publisher, udp_client(publisher.port) as (good, datagrams):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bad:
+            for number, rubbish in enumerate(MALFORMED * 5):
+                bad.sendto(rubbish, ("127.0.0.1", publisher.port))
+                good.sendto(request(number, *BLOCK))
+                await datagrams.wait_for(number + 1)
+            with pytest.raises(BlockingIOError):
+                bad.recv(512, socket.MSG_DONTWAIT)
+        assert [a[:2] for a in datagrams.answers] == [n.to_bytes(2, "big") for n in range(len(MALFORMED) * 5)]
+        assert publisher.counts.malformed == len(MALFORMED) * 5
     assert [record.message for record in caplog.records] == [f"Modbus: 127.0.0.1 {counts.STRANGE}"], "a line a minute"
 
 
 @pytest.mark.parametrize("rubbish", [b"\x00\x01\x00\x07\x00\x06\x01\x04", b"GET / HTTP/1.1\r\n\r\n", bytes(300)])
-def test_a_tcp_client_that_does_not_speak_modbus_is_closed(rubbish: bytes, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_tcp_client_that_does_not_speak_modbus_is_closed(
+    rubbish: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO)
-
-    async def run() -> None:
-        async with publishing() as publisher, tcp_client(publisher.port) as (other, writer):
-            async with tcp_client(publisher.port) as (reader, bad):
-                bad.write(request(1, *BLOCK) + rubbish + request(2, *BLOCK))
-                assert len(await closed(reader)) == 137, "what came before the rubbish is answered"
-            writer.write(request(3, *BLOCK))
-            assert (await read_answer(other))[:2] == b"\x00\x03"
-            assert publisher.counts.malformed == 1
-
-    asyncio.run(run())
+    async with publishing() as publisher, tcp_client(publisher.port) as (other, writer):
+        async with tcp_client(publisher.port) as (reader, bad):
+            bad.write(request(1, *BLOCK) + rubbish + request(2, *BLOCK))
+            assert len(await closed(reader)) == 137, "what came before the rubbish is answered"
+        writer.write(request(3, *BLOCK))
+        assert (await read_answer(other))[:2] == b"\x00\x03"
+        assert publisher.counts.malformed == 1
     assert f"Modbus: 127.0.0.1 {counts.STRANGE}" in caplog.text
 
 
-def test_clients_that_vanish_leave_nothing_behind() -> None:
-    async def run() -> None:
-        async with publishing() as publisher:
-            for number in range(50):
-                _, writer = await asyncio.open_connection("127.0.0.1", publisher.port)
-                writer.write(request(1, *BLOCK) + request(2, *BLOCK)[: number % 12])
-                await writer.drain()
-                writer.transport.abort()
-            await until(lambda: not publisher.counts.connections)
-            async with tcp_client(publisher.port) as (reader, writer):
-                writer.write(request(3, *BLOCK))
-                await read_answer(reader)
-
-    asyncio.run(run())
+async def test_clients_that_vanish_leave_nothing_behind() -> None:
+    async with publishing() as publisher:
+        for number in range(50):
+            _, writer = await asyncio.open_connection("127.0.0.1", publisher.port)
+            writer.write(request(1, *BLOCK) + request(2, *BLOCK)[: number % 12])
+            await writer.drain()
+            writer.transport.abort()
+        await until(lambda: not publisher.counts.connections)
+        async with tcp_client(publisher.port) as (reader, writer):
+            writer.write(request(3, *BLOCK))
+            await read_answer(reader)
 
 
-def test_an_answer_that_the_kernel_does_not_take_is_dropped() -> None:
+async def test_an_answer_that_the_kernel_does_not_take_is_dropped() -> None:
     class Full(socket.socket):
         def sendto(self, *_: Any) -> int:
             raise BlockingIOError(errno.EAGAIN, "no buffer space")
 
-    async def run() -> None:
-        publisher = ModbusPublisher(SystemClock())
-        sock = Full(socket.AF_INET, socket.SOCK_DGRAM)
-        sock.setblocking(False)
-        sock.bind(("127.0.0.1", 0))
-        endpoint = udp_endpoint.UdpEndpoint(sock, publisher._responder, publisher.counts)
-        async with udp_client(sock.getsockname()[1]) as (transport, datagrams):
-            transport.sendto(request(1, *BLOCK))
-            transport.sendto(request(2, *BLOCK))
-            await until(lambda: publisher.counts.unsent == 2)
-            assert datagrams.answers == []
-        endpoint.close()
-
-    asyncio.run(run())
+    publisher = ModbusPublisher(SystemClock())
+    sock = Full(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    sock.bind(("127.0.0.1", 0))
+    endpoint = udp_endpoint.UdpEndpoint(sock, publisher._responder, publisher.counts)
+    async with udp_client(sock.getsockname()[1]) as (transport, datagrams):
+        transport.sendto(request(1, *BLOCK))
+        transport.sendto(request(2, *BLOCK))
+        await until(lambda: publisher.counts.unsent == 2)
+        assert datagrams.answers == []
+    endpoint.close()
 
 
-def test_a_defect_is_told_to_the_client_and_wedges_nobody(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_defect_is_told_to_the_client_and_wedges_nobody(caplog: pytest.LogCaptureFixture) -> None:
     """Here: whatever takes commands raises. Clients with many requests in a row are served afterwards, too."""
 
     def broken(_: object) -> None:
@@ -120,21 +108,18 @@ def test_a_defect_is_told_to_the_client_and_wedges_nobody(caplog: pytest.LogCapt
     def command(number: int) -> bytes:
         return struct.pack(">HHHBBHHBHHiii", 9, 0, 23, 1, 16, 1000, 8, 16, number, 1, 0, 0, 0)
 
-    async def run() -> None:
-        async with (
-            publishing(write=True, on_command=broken) as publisher,
-            tcp_client(publisher.port) as (reader, writer),
-            udp_client(publisher.port) as (udp, datagrams),
-        ):
-            writer.write(request(1, *BLOCK) * 3 + command(1) + request(2, *BLOCK) * 3)
-            answers = [await read_answer(reader) for _ in range(7)]
-            assert [answer[7:9] for answer in answers] == [b"\x04\x80"] * 3 + [b"\x90\x04"] + [b"\x04\x80"] * 3
-            udp.sendto(command(2))
-            await datagrams.wait_for(1)
-            assert datagrams.answers[0][7:] == b"\x90\x04"
-            assert publisher._age_s == 0.0
-
-    asyncio.run(run())
+    async with (
+        publishing(write=True, on_command=broken) as publisher,
+        tcp_client(publisher.port) as (reader, writer),
+        udp_client(publisher.port) as (udp, datagrams),
+    ):
+        writer.write(request(1, *BLOCK) * 3 + command(1) + request(2, *BLOCK) * 3)
+        answers = [await read_answer(reader) for _ in range(7)]
+        assert [answer[7:9] for answer in answers] == [b"\x04\x80"] * 3 + [b"\x90\x04"] + [b"\x04\x80"] * 3
+        udp.sendto(command(2))
+        await datagrams.wait_for(1)
+        assert datagrams.answers[0][7:] == b"\x90\x04"
+        assert publisher._age_s == 0.0
     assert caplog.text.count("RuntimeError: a defect") == 1
 
 
@@ -157,77 +142,66 @@ def test_a_connection_that_cannot_be_served_is_closed_and_the_others_are_served(
     in_virtual_time(body)
 
 
-def test_a_defect_leaves_no_age_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_defect_leaves_no_age_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     """What comes over TCP afterwards is of now."""
-
-    async def run() -> None:
-        async with publishing(write=True) as publisher:
-            (endpoint,) = publisher._udp
-            monkeypatch.setattr(publisher._responder, "answer", None)
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-                sock.sendto(request(1, *BLOCK), ("127.0.0.1", publisher.port))
-                with pytest.raises(TypeError):
-                    endpoint._serve()
-            assert publisher._age_s == 0.0
-
-    asyncio.run(run())
+    async with publishing(write=True) as publisher:
+        (endpoint,) = publisher._udp
+        monkeypatch.setattr(publisher._responder, "answer", None)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.sendto(request(1, *BLOCK), ("127.0.0.1", publisher.port))
+            with pytest.raises(TypeError):
+                endpoint._serve()
+        assert publisher._age_s == 0.0
 
 
-def test_closing_drops_clients_and_frees_the_port() -> None:
-    async def run() -> None:
-        async with publishing() as publisher:
-            port = publisher.port
-            async with tcp_client(port) as (reader, _):
-                await asyncio.sleep(0.02)
-                await publisher.close()
-                await publisher.close()
-                assert await closed(reader) == b""
-            await publisher.start("127.0.0.1", 0)
-            assert publisher.port != port, "a new start asks for what it is told, not for the old port"
-            again = ModbusPublisher(SystemClock())
-            await again.start("127.0.0.1", port)
-            await again.close()
-
-    asyncio.run(run())
+async def test_closing_drops_clients_and_frees_the_port() -> None:
+    async with publishing() as publisher:
+        port = publisher.port
+        async with tcp_client(port) as (reader, _):
+            await asyncio.sleep(0.02)
+            await publisher.close()
+            await publisher.close()
+            assert await closed(reader) == b""
+        await publisher.start("127.0.0.1", 0)
+        assert publisher.port != port, "a new start asks for what it is told, not for the old port"
+        again = ModbusPublisher(SystemClock())
+        await again.start("127.0.0.1", port)
+        await again.close()
 
 
-def test_a_read_is_never_torn() -> None:
+async def test_a_read_is_never_torn() -> None:
     """Every point is set from the snapshot's number; a block that mixes two snapshots could not be consistent."""
+    async with publishing() as publisher:
+        done = asyncio.Event()
 
-    async def run() -> None:
-        async with publishing() as publisher:
-            done = asyncio.Event()
+        async def update() -> None:
+            number = 0
+            while not done.is_set():
+                number += 1
+                pose = (number / 1e4, -number / 1e4, 0.0)
+                publisher.publish(snapshot(seq=number, pose=pose, odom=pose, missed=number, loop_new=number))
+                await asyncio.sleep(0)
 
-            async def update() -> None:
-                number = 0
-                while not done.is_set():
-                    number += 1
-                    pose = (number / 1e4, -number / 1e4, 0.0)
-                    publisher.publish(snapshot(seq=number, pose=pose, odom=pose, missed=number, loop_new=number))
-                    await asyncio.sleep(0)
+        async def check(port: int) -> set[int]:
+            seen = set()
+            async with udp_client(port) as (transport, datagrams):
+                for index in range(400):
+                    transport.sendto(request(index, *BLOCK))
+                    await datagrams.wait_for(index + 1)
+                    values = registers.decode_block(datagrams.answers[index][9:])
+                    seq = int(values["seq"] or 0)
+                    assert values["map_x"] == seq / 1e4
+                    assert values["odom_y"] == -seq / 1e4
+                    assert values["missed"] == values["loop_new"] == seq
+                    seen.add(seq)
+            return seen
 
-            async def check(port: int) -> set[int]:
-                seen = set()
-                async with udp_client(port) as (transport, datagrams):
-                    for index in range(400):
-                        transport.sendto(request(index, *BLOCK))
-                        await datagrams.wait_for(index + 1)
-                        values = registers.decode_block(datagrams.answers[index][9:])
-                        seq = int(values["seq"] or 0)
-                        assert values["map_x"] == seq / 1e4
-                        assert values["odom_y"] == -seq / 1e4
-                        assert values["missed"] == values["loop_new"] == seq
-                        seen.add(seq)
-                return seen
-
-            publisher.publish(snapshot(seq=0, pose=(0.0, 0.0, 0.0), odom=(0.0, 0.0, 0.0), missed=0, loop_new=0))
-            updating = asyncio.create_task(update())
-            seen = await asyncio.gather(*(check(publisher.port) for _ in range(3)))
-            done.set()
-            await updating
-            assert all(len(numbers) > 50 for numbers in seen), "the snapshot must have changed while it was read"
-
-    asyncio.run(run())
+        publisher.publish(snapshot(seq=0, pose=(0.0, 0.0, 0.0), odom=(0.0, 0.0, 0.0), missed=0, loop_new=0))
+        updating = asyncio.create_task(update())
+        seen = await asyncio.gather(*(check(publisher.port) for _ in range(3)))
+        done.set()
+        await updating
+        assert all(len(numbers) > 50 for numbers in seen), "the snapshot must have changed while it was read"
 
 
 def in_virtual_time(body: Callable[[tcp_endpoint.TcpEndpoint], Coroutine[Any, Any, None]]) -> None:

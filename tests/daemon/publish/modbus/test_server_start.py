@@ -20,44 +20,32 @@ from hal.net.reply_address import reply_source
 from tests.daemon.publish.network import BLOCK, request, taken_port, udp_client
 
 
-def test_a_port_in_use_is_refused_with_a_remedy() -> None:
-    async def run() -> None:
-        with taken_port() as taken:
-            port = taken.getsockname()[1]
-            with pytest.raises(DeviceRefused, match=rf"Modbus on 127.0.0.1:{port}: the port is in use .*modbus\.port"):
-                await ModbusPublisher(SystemClock()).start("127.0.0.1", port)
-
-    asyncio.run(run())
+async def test_a_port_in_use_is_refused_with_a_remedy() -> None:
+    with taken_port() as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(DeviceRefused, match=rf"Modbus on 127.0.0.1:{port}: the port is in use .*modbus\.port"):
+            await ModbusPublisher(SystemClock()).start("127.0.0.1", port)
 
 
-def test_a_udp_port_in_use_leaves_no_tcp_listener_behind() -> None:
-    async def run() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-            taken.bind(("127.0.0.1", 0))
-            port = taken.getsockname()[1]
-            with pytest.raises(DeviceRefused, match="in use"):
-                await ModbusPublisher(SystemClock()).start("127.0.0.1", port)
-        publisher = ModbusPublisher(SystemClock())
-        await publisher.start("127.0.0.1", port)
-        await publisher.close()
-
-    asyncio.run(run())
+async def test_a_udp_port_in_use_leaves_no_tcp_listener_behind() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        with pytest.raises(DeviceRefused, match="in use"):
+            await ModbusPublisher(SystemClock()).start("127.0.0.1", port)
+    publisher = ModbusPublisher(SystemClock())
+    await publisher.start("127.0.0.1", port)
+    await publisher.close()
 
 
-def test_an_address_of_another_computer_is_missing() -> None:
-    async def run() -> None:
-        with pytest.raises(DeviceMissing, match=r"does not have that address .*bind"):
-            await ModbusPublisher(SystemClock()).start("203.0.113.7", 1502)
-
-    asyncio.run(run())
+async def test_an_address_of_another_computer_is_missing() -> None:
+    with pytest.raises(DeviceMissing, match=r"does not have that address .*bind"):
+        await ModbusPublisher(SystemClock()).start("203.0.113.7", 1502)
 
 
-def test_a_name_that_is_not_known_is_missing() -> None:
-    async def run() -> None:
-        with pytest.raises(DeviceMissing, match="host name not known"):
-            await ModbusPublisher(SystemClock()).start("no-such-host.invalid", 1502)
-
-    asyncio.run(run())
+async def test_a_name_that_is_not_known_is_missing() -> None:
+    with pytest.raises(DeviceMissing, match="host name not known"):
+        await ModbusPublisher(SystemClock()).start("no-such-host.invalid", 1502)
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
@@ -74,21 +62,18 @@ def test_another_error_keeps_the_systems_words() -> None:
 
 
 @pytest.mark.skipif(not socket.has_ipv6, reason="this computer has no IPv6")
-def test_ipv6_and_all_addresses() -> None:
-    async def run() -> None:
-        for bind in ("::1", ""):
-            publisher = ModbusPublisher(SystemClock())
-            try:
-                await publisher.start(bind, 0)
-            except DeviceMissing:
-                pytest.skip("this computer has no IPv6 loopback address")
-            client = AsyncModbusUdpClient("::1", port=publisher.port)
-            assert await client.connect()
-            assert (await client.read_input_registers(0, count=1)).registers == [0x4C4C]
-            client.close()
-            await publisher.close()
-
-    asyncio.run(run())
+async def test_ipv6_and_all_addresses() -> None:
+    for bind in ("::1", ""):
+        publisher = ModbusPublisher(SystemClock())
+        try:
+            await publisher.start(bind, 0)
+        except DeviceMissing:
+            pytest.skip("this computer has no IPv6 loopback address")
+        client = AsyncModbusUdpClient("::1", port=publisher.port)
+        assert await client.connect()
+        assert (await client.read_input_registers(0, count=1)).registers == [0x4C4C]
+        client.close()
+        await publisher.close()
 
 
 def test_every_address_of_a_computer_answers_for_itself() -> None:
@@ -119,15 +104,12 @@ def test_ipv6_is_answered_from_where_an_answer_can_come(asked: str, interface: i
         assert source[0][2] == told[:16] + struct.pack("@I", interface)
 
 
-def test_before_the_first_snapshot_the_state_is_starting() -> None:
-    async def run() -> None:
-        publisher = ModbusPublisher(SystemClock())
-        await publisher.start("127.0.0.1", 0)
-        async with udp_client(publisher.port) as (transport, datagrams):
-            transport.sendto(request(1, *BLOCK))
-            await datagrams.wait_for(1)
-        values = registers.decode_block(datagrams.answers[0][9:])
-        assert (values["seq"], values["state"], values["map_x"]) == (0, 0, None)
-        await publisher.close()
-
-    asyncio.run(run())
+async def test_before_the_first_snapshot_the_state_is_starting() -> None:
+    publisher = ModbusPublisher(SystemClock())
+    await publisher.start("127.0.0.1", 0)
+    async with udp_client(publisher.port) as (transport, datagrams):
+        transport.sendto(request(1, *BLOCK))
+        await datagrams.wait_for(1)
+    values = registers.decode_block(datagrams.answers[0][9:])
+    assert (values["seq"], values["state"], values["map_x"]) == (0, 0, None)
+    await publisher.close()

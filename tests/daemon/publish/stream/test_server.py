@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import re
 import socket
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -22,7 +23,6 @@ from daemon.publish.stream import server as stream_server
 from daemon.publish.stream import session as stream_session
 from daemon.publish.stream.server import Client, StreamServer, scan_message
 from daemon.snapshot import Snapshot, State
-from hal.clock import run_virtual
 from hal.errors import DeviceRefused
 from hal.lidar import VALID, LidarGeometry, RawScan
 from tests.daemon.publish.network import Wire
@@ -81,28 +81,25 @@ async def wanting(server: StreamServer, *topics: str) -> Tap:
     return tap
 
 
-def run(path: Path, body: Callable[[StreamServer], Awaitable[None]]) -> None:
-    """Run a test beside a server."""
-
-    async def both() -> None:
-        server = serve(path)
-        serving = asyncio.create_task(server.run())
-        await until(lambda: serving.done() or path.is_socket())
-        try:
-            await body(server)
-        finally:
-            for tap in Tap.OPEN:
-                tap.writer.close()
-            await asyncio.gather(*(tap.writer.wait_closed() for tap in Tap.OPEN), return_exceptions=True)
-            Tap.OPEN.clear()
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
-
-    asyncio.run(both())
+@contextlib.asynccontextmanager
+async def running(path: Path) -> AsyncIterator[StreamServer]:
+    """A server, and taps that are closed before it ends."""
+    server = serve(path)
+    serving = asyncio.create_task(server.run())
+    await until(lambda: serving.done() or path.is_socket())
+    try:
+        yield server
+    finally:
+        for tap in Tap.OPEN:
+            tap.writer.close()
+        await asyncio.gather(*(tap.writer.wait_closed() for tap in Tap.OPEN), return_exceptions=True)
+        Tap.OPEN.clear()
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
 
 
-def test_a_client_gets_what_it_asked_for(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_a_client_gets_what_it_asked_for(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         tap = await wanting(server, "pose", "scan", "state")
         server.publish(SNAPSHOT)
         server.on_scan(raw_scan())
@@ -117,11 +114,9 @@ def test_a_client_gets_what_it_asked_for(tmp_path: Path) -> None:
         assert np.array_equal((near, *rest), (1.0, np.inf, np.nan), equal_nan=True)
         assert scan["data"]["bearing_step"] == pytest.approx(np.pi / 180.0)
 
-    run(tmp_path / "stream", body)
 
-
-def test_states_and_loops_are_said_when_they_change(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_states_and_loops_are_said_when_they_change(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         tap = await wanting(server, "state", "loop")
         for seq, loops in enumerate((0, 0, 1, 1, 2)):
             server.publish(replace(SNAPSHOT, seq=seq, loop_counter=loops, loop_new=10 + loops, loop_old=1))
@@ -129,13 +124,11 @@ def test_states_and_loops_are_said_when_they_change(tmp_path: Path) -> None:
         assert [frame["topic"] for frame in frames] == ["state", "loop", "loop"]
         assert [frame["data"]["keyframe_new"] for frame in frames[1:]] == [11, 12]
 
-    run(tmp_path / "stream", body)
 
-
-def test_who_asks_for_the_state_is_told_it_at_once(tmp_path: Path) -> None:
+async def test_who_asks_for_the_state_is_told_it_at_once(tmp_path: Path) -> None:
     """It may not change for hours."""
 
-    async def body(server: StreamServer) -> None:
+    async with running(tmp_path / "stream") as server:
         early = await wanting(server, "state")
         server.publish(SNAPSHOT)
         late = await connected(server)
@@ -145,8 +138,6 @@ def test_who_asks_for_the_state_is_told_it_at_once(tmp_path: Path) -> None:
         server.publish(replace(SNAPSHOT, seq=8, state=State.LOST))
         assert (await late.frame())["data"]["state_name"] == "LOST", "and not again with the next request"
 
-    run(tmp_path / "stream", body)
-
 
 def test_without_clients_nothing_is_encoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     server = serve(tmp_path / "stream")
@@ -155,8 +146,8 @@ def test_without_clients_nothing_is_encoded(tmp_path: Path, monkeypatch: pytest.
     server.on_scan(raw_scan())
 
 
-def test_a_slow_client_gets_the_latest_and_every_event_and_others_all(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_a_slow_client_gets_the_latest_and_every_event_and_others_all(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         slow, quick = await wanting(server, "pose", "loop"), await wanting(server, "pose")
         seen: list[int] = []
 
@@ -181,20 +172,16 @@ def test_a_slow_client_gets_the_latest_and_every_event_and_others_all(tmp_path: 
         assert [frame["data"]["counter"] for frame in frames if frame["topic"] == "loop"] == [1, 2]
         assert len(frames) < 2000
 
-    run(tmp_path / "stream", body)
 
-
-def test_a_client_that_never_reads_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_client_that_never_reads_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream_session, "STUCK_S", 0.05)
 
-    async def body(server: StreamServer) -> None:
+    async with running(tmp_path / "stream") as server:
         tap = await wanting(server, "pose")
         tap.writer.transport.pause_reading()
         for seq in range(3000):
             server.publish(replace(SNAPSHOT, seq=seq))
         await until(lambda: not server.clients)
-
-    run(tmp_path / "stream", body)
 
 
 @pytest.mark.parametrize(
@@ -208,8 +195,10 @@ def test_a_client_that_never_reads_is_let_go(tmp_path: Path, monkeypatch: pytest
         (b"\x08\x00\x00\x00\x81\xa4want\x91\xa0"[:12], None),
     ],
 )
-def test_a_bad_request_is_told_and_ends_the_client_only(tmp_path: Path, request_: bytes, part: str | None) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_a_bad_request_is_told_and_ends_the_client_only(
+    tmp_path: Path, request_: bytes, part: str | None
+) -> None:
+    async with running(tmp_path / "stream") as server:
         good = await wanting(server, "pose")
         tap = await connected(server)
         tap.writer.write(request_)
@@ -221,46 +210,39 @@ def test_a_bad_request_is_told_and_ends_the_client_only(tmp_path: Path, request_
         server.publish(SNAPSHOT)
         assert (await good.frame())["topic"] == "pose"
 
-    run(tmp_path / "stream", body)
 
-
-def test_an_unknown_topic_is_named(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_an_unknown_topic_is_named(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         tap = await connected(server)
         tap.ask({"want": ["pose", "weather"]})
         assert "weather; there are pose" in (await tap.frame())["text"]
 
-    run(tmp_path / "stream", body)
 
-
-def test_many_requests_at_once_are_taken_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.virtual
+async def test_many_requests_at_once_are_taken_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each may have the whole map sent anew: the loop goes on in between, and no more of them are read meanwhile."""
     asked: list[frozenset[str]] = []
-
-    async def body() -> None:
-        server = serve(Path("unused"))
-        monkeypatch.setattr(server, "welcome", lambda client, fresh: asked.append(fresh))
-        client = Client(server)
-        wire = Wire(client)
-        client.connection_made(wire)
-        for turn in (1, 2):
-            client.data_received((stream_server.framed({"want": []}) + stream_server.framed({"want": ["map"]})) * 50)
-            assert (len(asked), wire.reading) == (100 * (turn - 1) + stream_session.REQUESTS_PER_TURN, False)
-            await asyncio.sleep(2.0)
-            assert (len(asked), wire.reading) == (100 * turn, True)
-        assert asked == [frozenset(), frozenset({"map"})] * 100
-        client.data_received(stream_server.framed({"want": []}) * 50)
-        wire.close()
+    server = serve(Path("unused"))
+    monkeypatch.setattr(server, "welcome", lambda client, fresh: asked.append(fresh))
+    client = Client(server)
+    wire = Wire(client)
+    client.connection_made(wire)
+    for turn in (1, 2):
+        client.data_received((stream_server.framed({"want": []}) + stream_server.framed({"want": ["map"]})) * 50)
+        assert (len(asked), wire.reading) == (100 * (turn - 1) + stream_session.REQUESTS_PER_TURN, False)
         await asyncio.sleep(2.0)
-        assert len(asked) == 200 + stream_session.REQUESTS_PER_TURN, "who has gone asks no more"
+        assert (len(asked), wire.reading) == (100 * turn, True)
+    assert asked == [frozenset(), frozenset({"map"})] * 100
+    client.data_received(stream_server.framed({"want": []}) * 50)
+    wire.close()
+    await asyncio.sleep(2.0)
+    assert len(asked) == 200 + stream_session.REQUESTS_PER_TURN, "who has gone asks no more"
 
-    run_virtual(body())
 
-
-def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream_session, "CLIENTS", 2)
 
-    async def body(server: StreamServer) -> None:
+    async with running(tmp_path / "stream") as server:
         taps = [await connected(server) for _ in range(2)]
         late = Tap(*await asyncio.open_unix_connection(str(server.path)))
         assert "2 clients" in (await late.frame())["text"]
@@ -268,33 +250,24 @@ def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.Monkey
         await until(lambda: len(server.clients) < 2)
         await connected(server)
 
-    run(tmp_path / "stream", body)
 
-
-def test_a_path_left_by_a_dead_program_is_taken(tmp_path: Path) -> None:
+async def test_a_path_left_by_a_dead_program_is_taken(tmp_path: Path) -> None:
     path = tmp_path / "stream"
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
-
-    async def body(server: StreamServer) -> None:
-        while True:
-            try:
+    async with running(path) as server:
+        while not Tap.OPEN:
+            with contextlib.suppress(ConnectionRefusedError):
                 await connected(server)
-                return
-            except ConnectionRefusedError:
-                await asyncio.sleep(0.001)
-
-    run(path, body)
+            await asyncio.sleep(0.001)
     assert not path.exists()
 
 
-def test_a_path_in_use_is_refused(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_a_path_in_use_is_refused(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         with pytest.raises(DeviceRefused, match="another program serves it"):
             await serve(server.path).run()
         await connected(server)
-
-    run(tmp_path / "stream", body)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
@@ -323,8 +296,8 @@ def test_a_scan_message_names_everything_a_reader_needs() -> None:
     assert (told["range_min"], told["range_max"], told["beam_dt"], told["period"]) == (0.023, 60.0, 0.0, 0.025)
 
 
-def test_the_reference_client_reads_it(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_the_reference_client_reads_it(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         command = [str(ROOT / "tools/clients/watch_stream.py"), str(server.path), "pose", "scan", "state", "faults"]
         server.publish(SNAPSHOT)
         server.on_faults(1.0, [(104, "no valid scan", "check the cable")])
@@ -343,5 +316,3 @@ def test_the_reference_client_reads_it(tmp_path: Path) -> None:
         assert b"2 of 3 beams, nearest 1.00 m" in await asyncio.wait_for(process.stdout.readline(), 10.0)
         process.terminate()
         await process.wait()
-
-    run(tmp_path / "stream", body)

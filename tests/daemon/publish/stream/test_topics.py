@@ -20,15 +20,15 @@ from estimator.mapping import grid_patches, live_grid
 from estimator.measurements import UNLIMITED, Scan
 from estimator.state import State
 from hal.adc import Blemish, RawSamples
-from tests.daemon.publish.stream.test_server import Tap, connected, run, until, wanting
+from tests.daemon.publish.stream.test_server import Tap, connected, running, until, wanting
 from tests.daemon.runtime.test_cycle import on_bench
 from tests.daemon.support.room import HALF_X, HALF_Y, ranges_m
 
 SILENT = (104, "no valid scan", "check the cable")
 
 
-def test_faults_are_told_at_first_and_when_they_change(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_faults_are_told_at_first_and_when_they_change(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         server.on_faults(1.0, [SILENT])
         tap = await wanting(server, "faults")
         first = await tap.frame()
@@ -38,15 +38,13 @@ def test_faults_are_told_at_first_and_when_they_change(tmp_path: Path) -> None:
         over = await tap.frame()
         assert over["data"] == {"t_mono": 3.0, "present": []}
 
-    run(tmp_path / "stream", body)
 
-
-def test_raw_bytes_are_told_as_they_pass_and_a_stuck_client_gets_the_latest_and_a_count(
+async def test_raw_bytes_are_told_as_they_pass_and_a_stuck_client_gets_the_latest_and_a_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stream_session, "BUFFER_BYTES", 4096)
 
-    async def body(server: StreamServer) -> None:
+    async with running(tmp_path / "stream") as server:
         tap = await wanting(server, "raw", "state")
         server.on_raw("lidar", "rx", 1.5, b"\x00\xff")
         server.on_samples(RawSamples(1, 0.0, 0.1, 2.0, 22222.2, np.array([1, 513], np.uint16), 12, Blemish(0), 0.0))
@@ -63,8 +61,6 @@ def test_raw_bytes_are_told_as_they_pass_and_a_stuck_client_gets_the_latest_and_
             times.append(frame["data"]["t_mono"])
         assert times == sorted(times)
         assert len(times) + frame["replaced"] == 2000
-
-    run(tmp_path / "stream", body)
 
 
 class Robot:
@@ -116,8 +112,8 @@ def known(tiles: dict[tuple[int, int], np.ndarray]) -> tuple[float, float]:
     return wide, tall
 
 
-def test_the_map_comes_whole_at_first_and_then_what_has_changed(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_the_map_comes_whole_at_first_and_then_what_has_changed(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         robot = Robot()
         tiles = server.tiles = MapTiles(lambda: robot.state, server.on_tiles)
         robot.drive(40)
@@ -137,11 +133,9 @@ def test_the_map_comes_whole_at_first_and_then_what_has_changed(tmp_path: Path) 
         assert {**whole, **changed}.keys() == anew.keys()
         tiles.close()
 
-    run(tmp_path / "stream", body)
 
-
-def test_another_map_empties_the_tiles_of_the_one_before(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_another_map_empties_the_tiles_of_the_one_before(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         robot = Robot()
         tiles = server.tiles = MapTiles(lambda: robot.state, server.on_tiles)
         robot.drive(30)
@@ -152,11 +146,9 @@ def test_another_map_empties_the_tiles_of_the_one_before(tmp_path: Path) -> None
         assert not any(zlib.decompress(cells).strip(b"\0") for _, cells in tiles.tiles.values())
         tiles.close()
 
-    run(tmp_path / "stream", body)
 
-
-def test_a_map_that_was_closed_is_drawn_anew_when_it_is_followed_again(tmp_path: Path) -> None:
-    async def body(server: StreamServer) -> None:
+async def test_a_map_that_was_closed_is_drawn_anew_when_it_is_followed_again(tmp_path: Path) -> None:
+    async with running(tmp_path / "stream") as server:
         robot = Robot()
         tiles = server.tiles = MapTiles(lambda: robot.state, server.on_tiles)
         robot.drive(30)
@@ -167,10 +159,8 @@ def test_a_map_that_was_closed_is_drawn_anew_when_it_is_followed_again(tmp_path:
         assert not tiles.error
         tiles.close()
 
-    run(tmp_path / "stream", body)
 
-
-def test_drawing_that_has_failed_is_tried_again(
+async def test_drawing_that_has_failed_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     fails = [True, True]
@@ -184,7 +174,7 @@ def test_drawing_that_has_failed_is_tried_again(
     monkeypatch.setattr(live_grid, "advance", advance)
     monkeypatch.setattr(maps_tiles, "AGAIN_S", 0.05)
 
-    async def body(server: StreamServer) -> None:
+    async with running(tmp_path / "stream") as server:
         robot = Robot()
         tiles = server.tiles = MapTiles(lambda: robot.state, server.on_tiles)
         robot.drive(30)
@@ -202,16 +192,16 @@ def test_drawing_that_has_failed_is_tried_again(
         assert tiles.tiles
         assert not tiles.error
         tiles.close()
-
-    run(tmp_path / "stream", body)
     assert caplog.text.count("it is tried again") == 2
 
 
-def test_a_stuck_client_gets_the_tiles_when_it_has_caught_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_stuck_client_gets_the_tiles_when_it_has_caught_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(stream_session, "BUFFER_BYTES", 1024)
     monkeypatch.setattr(stream_server, "TILE_BYTES", 1)
 
-    async def body(server: StreamServer) -> None:
+    async with running(tmp_path / "stream") as server:
         tiles = server.tiles = MapTiles(lambda: None, server.on_tiles)
         noise = np.random.default_rng(1)
         for column in range(200):
@@ -225,8 +215,6 @@ def test_a_stuck_client_gets_the_tiles_when_it_has_caught_up(tmp_path: Path, mon
         tiles.tiles[199, 0] = 2, zlib.compress(bytes(stream_server.SIDE**2))
         assert len(await received(tap)) == 199
         assert client.shown == (2, (199, 0))
-
-    run(tmp_path / "stream", body)
 
 
 def test_side_and_unit_are_those_of_the_estimator() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import subprocess
 import sys
 from pathlib import Path
@@ -10,51 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hal.adc import RawSamples
-from hal.bus.opening import open_bus
-from hal.clock import SystemClock
 from hal.errors import DataInvalid
 from hal.fake.adc.light import OrdinaryLamps, RecordedLight
-from hal.photodiode.dc_channel import LevelInput
-from hal.photodiode.driver import PhotodiodeAdc, Sampling
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-W", "error", "-m", "hal.fake.adc.receiver", *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-@pytest.mark.realtime
-def test_a_receiver_that_the_driver_reads(tmp_path: Path) -> None:
-    faults = tmp_path / "faults.toml"
-    faults.write_text("[[fault]]\nwhat = 'nack'\nevery = 10\n")
-    where = f"unix:{tmp_path}/i2c"
-    process = start(where, "--dc", "0.25", "--scl-percent", "-1", "--faults", str(faults), "--seconds", "40")
-    assert process.stdout is not None
-    assert "1 faults" in process.stdout.readline()
-    assert process.stdout.readline().strip() == f"MCP3221 at 0x4d on {where}"
-
-    async def main() -> None:
-        blocks: list[RawSamples] = []
-        sampling = Sampling(level=LevelInput())
-        driver = PhotodiodeAdc(where, 0x4D, "MCP3221", clock=SystemClock(), opener=open_bus, sampling=sampling)
-        task = asyncio.create_task(driver.run(blocks.append))
-        end = asyncio.get_running_loop().time() + 4 * 4.0
-        while len(blocks) < 30 or driver.status.recoveries < 2:
-            assert asyncio.get_running_loop().time() < end, driver.status
-            await asyncio.sleep(0.01)
-        assert driver.status.extra["dc_level"] == "25.0 %"
-        assert abs(blocks[-1].rate_hz / (0.99 * 400e3 / 18) - 1.0) < 0.02
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-
-    try:
-        asyncio.run(main())
-    finally:
-        process.terminate()
-        out, err = process.communicate(timeout=20)
-    assert process.returncode == 0, err
-    assert "transactions" in out
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ import asyncio
 import numpy as np
 import pytest
 
-from hal.fake.lidar.dialect_grid import State
-from tests.hal.fake.bench import Talk, read, virtual
+from tests.hal.fake.bench import Talk, virtual
 from tests.hal.fake.wire import FRAME, MD, PERIOD, order, pieces
 
 
@@ -46,18 +45,6 @@ def test_delayed() -> None:
     assert len(times) == 118  # none lost
 
 
-def test_silence() -> None:
-    times, _ = arrivals(order("silence", when=1.0, **{"for": 1.0}))
-    assert np.max(np.diff(times)) == pytest.approx(1.0, abs=2 * PERIOD)
-    assert len(times) == pytest.approx(80, abs=2)
-
-
-def test_stall_and_burst() -> None:
-    times, stamps = arrivals(order("stall", when=0.5, **{"for": 2.0}))
-    assert np.sum(np.array(times) == 2.5) == pytest.approx(80, abs=1)
-    assert np.all(np.abs(np.diff(stamps) - 1e3 * PERIOD) < 1)  # nothing is lost
-
-
 @pytest.mark.parametrize("size", [1, 64, 4096])
 def test_pieces(clean: list[bytes], size: int) -> None:
     got = pieces(order("chunks", piece=size), 0.2)
@@ -84,23 +71,3 @@ def test_three_scans_in_one_write(clean: list[bytes]) -> None:
     assert got[1] == b"".join(clean[1:4])
     assert {len(data) for data in got[1:]} == {3 * FRAME}
     assert len(got) == 13
-
-
-def test_ignore_counts() -> None:
-    async def scene(talk: Talk) -> list[int]:
-        talk.schedule.load(order("ignore", command="QT", count=2))
-        await talk.ask(MD, 0.1)
-        heard = []
-        for _ in range(3):
-            replies = await talk.ask("QT", 0.2)
-            heard.append(sum(reply.echo == "QT" for reply in replies))
-        assert talk.device.state is State.IDLE
-        return heard
-
-    assert virtual(scene) == [0, 0, 1]
-
-
-def test_acknowledgement_lost() -> None:
-    got = [read(data).status for data in pieces(order("no_reply", command="MD", count=1))]
-    assert set(got) == {"99"}
-    assert len(got) > 30

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 from collections.abc import Awaitable, Callable
 
 import pytest
 
-from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import UST_10LX
@@ -98,17 +96,5 @@ def test_tcp_drops_at_reboot_and_comes_back() -> None:
         async with Client(port) as host:
             host.writer.write(b"QT\n")
             assert await host.reply() == b"QT\n00P\n\n"
-
-    on_tcp(scene)
-
-
-def test_tcp_host_that_does_not_read() -> None:
-    async def scene(device: FakeHokuyo, _server: TcpServer, port: int) -> None:
-        schedule = FaultSchedule({"lidar": device})
-        schedule.load("[[fault]]\nwhat = 'slow'\nfactor = 0.1")
-        with socket.create_connection(("127.0.0.1", port)) as slow:
-            slow.sendall(b"NE0000108000000\n")
-            await until(lambda: device.counts.refused_by_host, 15.0)
-        schedule.close()
 
     on_tcp(scene)

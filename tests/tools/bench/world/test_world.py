@@ -1,16 +1,12 @@
-"""A bench computer as the world: scenario files, the judge, the DAC's wire, the serial end, and a robot computer."""
+"""A played world: scenario files, the judge, and a robot computer that drives in it."""
 
 from __future__ import annotations
 
-import asyncio
-import json
 import math
 import os
-import signal
 import subprocess
 import sys
 import threading
-import time
 import tty
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -20,25 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hal.errors import DeviceMissing
-from hal.fake.lidar.device import FakeHokuyo
-from hal.fake.lidar.scan_world import Room
-from tests.hil.programs import served_receiver
-from tools.bench.report import Result, Seen
-from tools.bench.world import __main__ as world
-from tools.bench.world import agreement, room
-from tools.bench.world.__main__ import main, twins
+from tools.bench.report import Seen
+from tools.bench.world import agreement
+from tools.bench.world.__main__ import twins
 from tools.bench.world.judge import Played, Read, errors_of, judged, pictures
 from tools.bench.world.local import robot
 from tools.bench.world.scenario import BUILT_IN, Expectation, Scenario, find, load
-from tools.bench.world.serialend import SerialEnd
-from tools.bench.world.stage import CannotPlay, Ends
-from tools.sim.light.scene import SceneLight
 
 ROOT = Path(__file__).parents[4]
 Floats = np.ndarray
-"""4.7 kOhm and 10 nF."""
-LEAST = '[[expect]]\nwhat = "never"\nis = "LOST"\n'
 
 
 # files
@@ -51,85 +37,6 @@ def test_scenarios_that_come_with_the_bench_are_whole(path: Path) -> None:
     assert all(one.until <= made.drive.seconds and one.from_ < made.drive.seconds for one in made.expect)
     assert made.scene(held=True).held
     assert find(path.stem) == path
-
-
-def test_a_dac_that_is_not_there_is_named_and_not_the_robot(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On the bench's own bus nobody acknowledges its address; else all that is said is that no lamp was received."""
-    file = tmp_path / "short.toml"
-    file.write_text('[world]\nlamps = true\nbuilding = "paper_room"\n[drive]\nsettle = 20.0\n' + LEAST)
-    monkeypatch.setattr(SceneLight, "prepare", lambda light: None)
-    monkeypatch.setattr(SceneLight, "sample", lambda light, t: np.zeros(len(t)))
-    with served_receiver(tmp_path) as served:
-        dac = f"dac:{served.partition('@')[0]}@0x60"
-        line = ["--modbus", "127.0.0.1:9", "--lidar", f"pty:{tmp_path / 'l'}", "--light", dac]
-        assert main([str(file), *line]) == 2
-    said = capsys.readouterr().out
-    assert "nobody answers" not in said
-    assert "MCP4725" in said
-    assert "0x60" in said
-
-
-def test_a_robot_computer_that_does_not_answer_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "short.toml"
-    file.write_text("[drive]\nsettle = 0.2\n" + LEAST)
-    assert main([str(file), "--modbus", "127.0.0.1:9", "--lidar", f"pty:{tmp_path / 'l'}"]) == 2
-    assert "nobody answers at 127.0.0.1 port 9" in capsys.readouterr().out
-    assert not (tmp_path / "l").exists()
-
-
-@pytest.mark.parametrize(("raised", "says"), [(CannotPlay("no answer"), "no answer"), (KeyboardInterrupt(), "ended")])
-def test_what_was_played_before_the_end_is_reported(
-    raised: BaseException,
-    says: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """The second of three cannot be played; it is told of, and the first one's results are not lost."""
-
-    def tried(scenario: Scenario, ends: Ends, twin: bool) -> list[Result]:
-        if scenario.name != "lap":
-            raise raised
-        return [Result("lap.error", "a lap", True, 17.0, "seen")]
-
-    monkeypatch.setattr(world, "tried", tried)
-    words = ["lap", "cable", "garbage", "--lidar", "pty:x", "--modbus", "127.0.0.1", "--out", str(tmp_path)]
-    assert main(words) == 2
-    said = capsys.readouterr().out
-    assert says in said
-    assert f"1 of 1 as expected; {tmp_path}/report.html" in said
-    kept = json.loads((tmp_path / "results.json").read_text())["results"]
-    assert [(one["name"], one["passed"]) for one in kept] == [
-        ("lap.error", True),
-        ("cable", False),
-        ("garbage", False),
-    ]
-    assert all(says in one["skipped"] for one in kept[1:])
-
-
-@pytest.mark.system
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_bench_that_is_ended_leaves_no_daemon(number: int, tmp_path: Path) -> None:
-    """In the middle of waiting for a pose."""
-    command = [sys.executable, "-m", "tools.bench.world", "lap", "--local", "--out", str(tmp_path / "out")]
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env=environment) as bench:
-        assert bench.stdout is not None
-        assert "waiting for a pose" in bench.stdout.readline()
-        (log,) = tmp_path.glob("lumiloop-world-*/daemon.log")
-        (child,) = Path(f"/proc/{bench.pid}/task/{bench.pid}/children").read_text().split()
-        bench.send_signal(number)
-        said = bench.communicate(timeout=60.0)[0]
-    end = time.monotonic() + 10.0
-    while Path("/proc", child).exists() and "Z" not in Path("/proc", child, "stat").read_text().rpartition(")")[2]:
-        assert time.monotonic() < end, "the daemon goes on"
-        time.sleep(0.02)
-    if number != signal.SIGKILL:
-        assert bench.returncode == 2
-        assert "ended before its end" in said
-        assert not log.parent.exists()
 
 
 # the judge
@@ -234,31 +141,6 @@ def test_under_surveyed_lamps_the_map_lies_in_the_survey_once_light_has_told() -
     assert errors_of(told(0.0)).t_site == pytest.approx(4.05)
 
 
-def test_a_pose_that_is_wrong_does_not_choose_the_frame_it_is_judged_in() -> None:
-    """Without a jump that is counted the map is where it was; a survey that is never found is no place in it."""
-    assert errors_of(told(0.0, counted=False)).metres.max() > 1.0
-    never = replace(played(), lamps=frozenset({7}))
-    holds, seen = judged(Expectation("error", at_most=0.1), never)
-    assert not holds
-    assert "never told" in seen.said
-    assert judged(Expectation("error", at_most=0.1), replace(never, lamps=frozenset()))[0]
-    assert judged(Expectation("error", at_most=0.1), told(0.0))[0]
-
-
-def test_two_runs_are_compared_until_a_fault_strikes() -> None:
-    """What a fault does depends on the scan that it strikes; before it both say the same."""
-    moved = played(lambda t: 0.5 if t > 3.1 else 0.0)
-    assert agreement.alike_s(moved.scenario) == 3.0
-    assert agreement.differences(agreement.trace(played()), agreement.trace(moved))[1].max() < 1e-9
-    whole = replace(SCENARIO, faults=())
-    apart = agreement.differences(
-        agreement.trace(replace(played(), scenario=whole)), agreement.trace(replace(moved, scenario=whole))
-    )
-    assert apart[1].max() == pytest.approx(0.5, abs=1e-6)
-    early = replace(moved, scenario=replace(SCENARIO, faults=({"when": 1.0},)))
-    assert "before it has driven" in twins(early.scenario, early).skipped
-
-
 def test_two_runs_are_compared_until_one_closes_a_loop() -> None:
     """With which keyframe depends on the scans, and what that is good for is centimetres."""
     moved = played(lambda t: 0.02 if t > 2.0 else 0.0)
@@ -274,55 +156,6 @@ def test_two_runs_are_compared_until_one_closes_a_loop() -> None:
     way, _, largest = agreement.figures(agreement.trace(at_once), agreement.trace(moved), "x")[0]
     assert way.value == 0.0
     assert not largest.value <= 10.0, "what could not be compared does not agree"
-
-
-def test_the_benchs_room_and_lidar_stand_beside_the_others() -> None:
-    assert room.model("bench").steps == 181
-    assert room.place("bench").name == "bench"
-    assert room.place("office_floor").name != "bench"
-    with pytest.raises(ValueError, match="no building is called"):
-        room.place("barn")
-
-
-# the DAC
-
-
-def test_the_lidar_comes_out_of_a_serial_port() -> None:
-    async def talk() -> tuple[bytes, DeviceMissing]:
-        master, slave = os.openpty()
-        tty.setraw(slave)
-        device = FakeHokuyo(room.LIDAR, Room(room.LIDAR))
-        end = SerialEnd(device, os.ttyname(slave))
-        os.write(master, b"QT\nVV\nMD0000018001000\n")
-        heard = b""
-        os.set_blocking(master, False)
-        for _ in range(200):
-            await asyncio.sleep(0.01)
-            with suppressed():
-                heard += os.read(master, 65536)
-            if heard.count(b"MD0000018001000\n99b") >= 2:
-                break
-        os.close(slave)
-        os.close(master)
-        await asyncio.sleep(0.05)
-        lost = end.lost
-        end.close()
-        device.close()
-        assert isinstance(lost, DeviceMissing)
-        return heard, lost
-
-    heard, lost = asyncio.run(talk())
-    assert b"SERI:" in heard
-    assert heard.count(b"MD0000018001000\n99b") >= 2
-    assert "start anew" in str(lost)
-
-
-@contextmanager
-def suppressed() -> Generator[None]:
-    try:
-        yield
-    except BlockingIOError:
-        return
 
 
 @contextmanager
@@ -379,3 +212,12 @@ def test_a_robot_computer_drives_in_the_played_world(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert "3 of 3 as expected" in done.stdout
     assert "<svg" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_scenario_of_the_page_is_one(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "bench.md").read_text()
+    (text,) = [block.partition("```")[0] for block in page.split("```toml\n")[1:] if "[[expect]]" in block]
+    (tmp_path / "my.toml").write_text(text)
+    made = load(tmp_path / "my.toml")
+    assert {fault["what"] for fault in made.faults} == {"silence", "carry"}
+    assert max(one.until for one in made.expect) == 35.0

@@ -1,4 +1,4 @@
-"""The integrity runs' own judgement, and that scenarios repeat; a short one through the whole cycle."""
+"""The integrity campaign: its judgement, product scenarios, and a short drive."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 
 from daemon.snapshot import State
 from tools.experiments.integrity import campaign
-from tools.experiments.integrity.report import COLUMNS, Array, Summary, judged, longest, report
-from tools.experiments.integrity.run import run, scans
-from tools.experiments.integrity.scene import KINDS, draw
+from tools.experiments.integrity.report import COLUMNS, Array, judged, report
+from tools.experiments.integrity.run import run
+from tools.experiments.integrity.scene import draw
 from tools.experiments.report import draw as draw_pictures
 
 AT = {name: number for number, name in enumerate(COLUMNS)}
@@ -47,16 +47,6 @@ def test_a_wrong_state_counts_once_it_has_lasted() -> None:
     assert not judged("a-0", rows, ALL, (True, False, "")).wrong
 
 
-def test_no_scan_is_half_of_before_the_robot_was_switched_off() -> None:
-    """It would be half of one place and half of another, and the lidar is switched off with the robot."""
-    scene = draw("restart_unlit", 6)
-    (off,) = scene.restarts
-    scene.seconds = off + 1.0
-    seen = [(scan.t_mono, scan.t_rx) for scan in scans(scene)]
-    assert seen[-1][0] > off
-    assert not [begin for begin, end in seen if begin < off < end - 0.002]
-
-
 def test_bounds_and_shares_are_counted() -> None:
     rows = track()
     rows[200:210, AT["error_m"]] = 0.4
@@ -67,32 +57,6 @@ def test_bounds_and_shares_are_counted() -> None:
     assert (found.beyond_bound, found.bounded) == (10, 550)
     assert found.tracking == pytest.approx(0.8)
     assert found.recoverable == 1.0
-
-
-def test_what_a_robot_tells_its_place_by_is_reported_apart() -> None:
-    said = [judged("a-0", track(), ALL, (True, True, facts)) for facts in ("", "{'lit': True}")]
-    often = track(15.0, error_m=0.015, error_rad=0.01, sigma_m=0.01)
-    seldom = track(5.0, error_m=0.025, error_rad=0.01, sigma_m=0.01)
-    text = Summary(said, [np.vstack([often, seldom]), often]).text()
-    assert "laser only, without wheels: TRACKING in clean drives 100.0% of 1; median error 1.5 cm" in text
-    assert "within two sigmas 75.0%, three 100.0%" in text
-    assert "lit, without wheels" in text
-
-
-def test_a_stretch_ends_where_cycles_are_missing() -> None:
-    t = np.array((0.0, 0.1, 0.2, 1.0, 1.1))
-    assert longest(t, np.ones(5, bool)) == pytest.approx(0.2)
-    assert longest(t, np.zeros(5, bool)) == 0.0
-
-
-@pytest.mark.parametrize("kind", sorted(KINDS))
-def test_every_kind_can_be_drawn_and_repeats(kind: str) -> None:
-    one, two = draw(kind, 5), draw(kind, 5)
-    assert one.seconds >= 60.0
-    t = np.linspace(0.0, one.seconds, 50)
-    np.testing.assert_array_equal(one.pose(t), two.pose(t))
-    assert bool(one.ceilings) == one.lit == (one.told is not None)
-    assert float(one.place.world.clearance(one.pose(np.array([0.0]))[:, :2]).min()) > 0.3
 
 
 @pytest.mark.jit

@@ -1,4 +1,4 @@
-"""Where am I: the experiment's own parts, and a few robots switched on and carried away in the lit house."""
+"""Relocation: the judge of an outcome, and a few robots in the lit house."""
 
 from __future__ import annotations
 
@@ -8,36 +8,9 @@ import pytest
 from daemon.snapshot import State
 from estimator.light_filter.light_channel import LightsSetup
 from tools.experiments.relocation.maps import mapped
-from tools.experiments.relocation.relocate import at_most
 from tools.experiments.relocation.trial import Case, Moment, outcome, trial
-from tools.experiments.relocation.worlds import Carried, Site, Stroll, lit_house, odometry, stroll
+from tools.experiments.relocation.worlds import Site, lit_house
 from tools.sim.ceiling.ceiling import Effects
-
-
-def test_none_of_n_proves_three_by_n() -> None:
-    assert at_most(0, 1000) == pytest.approx(3.0 / 1000, rel=0.01)
-    assert at_most(0, 40) == pytest.approx(0.072, abs=0.001)
-    assert at_most(2, 100) == pytest.approx(0.0616, abs=0.001)
-
-
-def test_places_are_free_and_codes_of_a_room_that_is_repeated_are_not_unique() -> None:
-    site, twice = Site(lit_house(), Effects(), 1), Site(lit_house(reused=True), Effects(), 1)
-    assert site.place.building.world.clearance(site.free).min() > 0.4
-    at = np.array((2.2, 3.0))
-    assert site.unique(at)
-    assert not twice.unique(at)
-    way = stroll(site, np.random.default_rng(1), 5.0, moving=True)
-    assert len(site.codes_at(way.begin[None, :2])[0]) >= 3
-
-
-def test_being_carried_is_no_motion_for_the_wheels() -> None:
-    first = Stroll(np.array((1.0, 2.0, 0.5)), 0.3, 0.2)
-    way = Carried(first, Stroll(np.array((9.0, 4.0, -2.0)), 0.2, 0.0), 2.0, 3.5)
-    turns = list(odometry(way.rolled, (0.0, 6.0), np.random.default_rng(0)))
-    in_the_air = [turn for turn in turns if 2.0 < turn.t_begin < 3.4]
-    assert all(np.array_equal(turn.delta, np.zeros(3)) for turn in in_the_air)
-    assert way.at(np.array([3.5]))[0] == pytest.approx((9.0, 4.0, -2.0))
-    assert np.hypot(*way.at(np.array([6.0]))[0, :2] - (9.0, 4.0)) == pytest.approx(0.5)
 
 
 def test_an_outcome_counts_from_when_it_was_put_down_and_says_how_long_tracking_was_wrong() -> None:

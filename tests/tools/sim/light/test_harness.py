@@ -53,30 +53,3 @@ def test_both_fidelities_report_the_same_lamps(waveform: Run, link: Run) -> None
     assert len(codes(waveform.snapshots[-1]) ^ codes(link.snapshots[-1])) <= 2
     for out in (waveform, link):
         assert np.hypot(*(out.site[-1, :2] - out.site[0, :2])) > 1.0
-
-
-def test_one_seed_gives_one_run(waveform: Run) -> None:
-    again = run(4.0, LIT)
-    np.testing.assert_array_equal(again.pose, waveform.pose)
-    assert [codes(s) for s in again.snapshots] == [codes(s) for s in waveform.snapshots]
-
-
-def test_without_a_lidar_the_lamps_are_still_seen() -> None:
-    scene = SimulatedScene(LIT)
-    with pytest.raises(ValueError, match="lights must be in the scenario"):
-        run(1.0, Scenario(), lidar=False)
-    out = run(12.0, scene=scene, lidar=False)
-    assert len(codes(out.snapshots[-1])) >= 8
-    assert out.scans_sent == 0
-    assert out.placed[-1]
-
-
-def test_a_fault_of_the_converter_is_ordered_by_its_name() -> None:
-    out = run(3.0, LIT, faults='[[fault]]\nwhere = "adc"\nwhat = "off"\nwhen = 2.0\n')
-    assert any(snapshot.adc_ok for snapshot in out.snapshots)
-    assert out.snapshots[-1].adc_ok is False
-
-
-def test_a_fidelity_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected waveform or link"):
-        Lights("ray")

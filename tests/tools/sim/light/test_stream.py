@@ -11,11 +11,10 @@ from estimator.cdma.air_interface import PROFILE_A
 from estimator.cdma.decoder import decode, new_decoder, search
 from estimator.cdma.epoch import SampleBlock
 from tools.sim.ceiling.ceiling import Array, Effects, paper_ceiling
-from tools.sim.ceiling.links import ACQUIRE, HEARD, Links
-from tools.sim.light.stream import IN_VIEW_A, KNOT_S, LightStream, Track
-from tools.sim.light.waveform import Ambient, Bus, Ceiling, Receiver
+from tools.sim.ceiling.links import ACQUIRE, Links
+from tools.sim.light.stream import IN_VIEW_A, LightStream
+from tools.sim.light.waveform import Ceiling
 
-CLEAR = Receiver(enob=30.0, thermal_a=0.0)
 RATE = 400e3 / 18
 
 
@@ -36,42 +35,6 @@ def test_blocks_in_a_row_are_the_plain_simulators_blocks() -> None:
     plain = Ceiling([lamp for lamp, lit in zip(lamps, seen, strict=True) if lit])
     for begin in (1.0, 1.0503, 1.1009, 9.0):
         np.testing.assert_allclose(stream.coded(instants(begin)), plain._signal(instants(begin)), atol=5e-11)
-
-
-def test_a_stale_first_sample_is_followed_by_fresh_ones() -> None:
-    stream, other = (LightStream(paper_ceiling(seed=1), at_rest()) for _ in range(2))
-    fresh = instants(5.0)
-    stale = np.concatenate([[1.0], fresh[1:]])
-    np.testing.assert_allclose(stream.coded(stale)[1:], other.coded(fresh)[1:], atol=5e-11)
-    np.testing.assert_allclose(stream.coded(instants(4.0)), other.coded(instants(4.0)), atol=1e-15)
-
-
-def test_flicker_and_noise_are_those_of_the_plain_simulator() -> None:
-    ambient = Ambient(current_a=40e-6)
-    stream = LightStream(paper_ceiling(Effects(gain_spread=0.0)), at_rest(), receiver=CLEAR, ambient=ambient)
-    t = instants(2.0, 4444)
-    share = float(stream._share(t)[0])
-    np.testing.assert_allclose(stream._flicker(t), share * Ceiling([], ambient, CLEAR)._tones(t), atol=1e-12)
-    assert 0.7 < share < 1.3
-    noise = LightStream(paper_ceiling(), at_rest(), ambient=ambient)._noise(instants(2.0, 20_000))
-    plain = Ceiling([], ambient, bus=Bus())._noise(20_000)
-    assert noise.std() == pytest.approx(plain.std(), rel=0.03)
-
-
-def test_strengths_follow_the_robot() -> None:
-    ceiling = paper_ceiling(seed=2)
-    track = Track(ceiling, lambda t: np.column_stack([0.6 * (t - 3.0), np.ones(len(t)), np.zeros(len(t))]))
-    for t in (3.0, 3.31, 4.44, 3.1):
-        exact = ceiling.amplitudes(np.array([[0.6 * (t - 3.0), 1.0, 0.0]]), np.array([t]))[0]
-        np.testing.assert_allclose(track.at(t), exact, rtol=0.02, atol=2e-9)
-    assert KNOT_S * 0.6 < 0.02  # m between knots
-
-
-def test_the_dc_channel_sees_daylight_and_lamps() -> None:
-    stream = LightStream(paper_ceiling(), at_rest(), ambient=Ambient(current_a=100e-6))
-    level = stream.level(np.array([1.0]))
-    assert level[0] == pytest.approx((100e-6 * float(stream._share(np.array([1.0]))[0]) + 6e-6) / 2e-3, rel=0.1)
-    assert LightStream(paper_ceiling(), at_rest(), ambient=Ambient(current_a=1.0)).level(np.array([1.0]))[0] == 1.0
 
 
 def errors_of_decoder(seed: int, blocks: int) -> tuple[Array, Array, Array, int]:
@@ -138,11 +101,3 @@ def test_both_fidelities_err_alike_in_a_quick_sample() -> None:
 @pytest.mark.slow
 def test_both_fidelities_err_alike() -> None:
     compare(range(8), 250, slack=0.1)
-
-
-@pytest.mark.slow
-def test_both_fidelities_hear_what_lamps_say_after_three_seconds() -> None:
-    for seed in range(3):
-        told = [run[2] for run in (errors_of_decoder(seed, 2 * HEARD), errors_of_links(seed, 2 * HEARD))]
-        first = [int(np.argmax(row >= 6)) for row in told]
-        assert abs(first[0] - first[1]) < 12

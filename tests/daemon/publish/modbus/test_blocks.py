@@ -1,0 +1,153 @@
+"""What all appended blocks share: refusals, reads of a part, the frozen contracts and the pages."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.publish import document
+from daemon.publish.modbus import integrity_block, lights_block, parts_block, registers, timing_block
+from daemon.publish.modbus.points import Layout
+from daemon.publish.modbus.requests import BLOCKS, Responder
+from daemon.snapshot import LightFix, LinkUse, LoopReason, Part, Snapshot, Stage, Thread
+from tests.daemon.publish.modbus.test_integrity_block import TRUST
+from tests.daemon.publish.modbus.test_lights_block import picture
+from tests.daemon.publish.modbus.test_parts_block import CONDITION
+from tests.daemon.publish.modbus.test_registers import snapshot
+from tests.daemon.publish.modbus.test_timing_block import PULSE
+
+FROZEN = Path(__file__).parent / "frozen"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A block with its place, an example, a part that a client may read, ranges it may not, and its contract.
+
+    Attributes:
+        numbers: what its words mean; names in `appended` may be added without a new version.
+        tail: its part of the datagram, and the first byte of it.
+    """
+
+    block: Any
+    example: Snapshot
+    address: int
+    size: int
+    part: tuple[int, int]
+    refused: tuple[tuple[int, int], ...]
+    numbers: dict[str, Any]
+    appended: tuple[str, ...] = ()
+    tail: tuple[Layout, int] | None = None
+
+
+CASES = {
+    "lights": Case(
+        lights_block.BLOCK, snapshot(light=picture()), 200, 120, (222, 6), ((199, 2), (200, 121), (320, 1), (319, 2)),
+        {"fixes": {fix.name: fix.value for fix in LightFix}, "uses": {use.name: use.value for use in LinkUse}},
+        ("fixes", "uses"), (lights_block.TAIL, 128),
+    ),
+    "integrity": Case(
+        integrity_block.BLOCK, snapshot(trust=TRUST), 340, 14, (344, 2), ((339, 2), (340, 15)),
+        {
+            "witnesses": [name for name, _, _ in integrity_block.WITNESSES],
+            "reasons": {why.name: why.value for why in LoopReason},
+        },
+        ("witnesses", "reasons"), (integrity_block.TAIL, 152),
+    ),
+    "pulse": Case(
+        timing_block.BLOCK, snapshot(pulse=PULSE), 354, 46, (358, 1), ((353, 2), (354, 47)),
+        {"rungs": len(timing_block.RUNGS), "stages": {stage.name: stage.value for stage in Stage}},
+    ),
+    "parts": Case(
+        parts_block.BLOCK, snapshot(condition=CONDITION), 400, 34, (407, 1), ((400, 35),),
+        {
+            "parts": {part.name: part.value for part in Part},
+            "threads": {thread.name: thread.value for thread in Thread},
+        },
+    ),
+}  # fmt: skip
+EACH = pytest.mark.parametrize("name", CASES)
+
+
+@EACH
+def test_a_block_that_is_not_ours_is_refused(name: str) -> None:
+    case = CASES[name]
+    for at, word, words in ((0, 0x4C4C, "magic"), (1, 2, "version 2"), (3, 1, "torn"), (case.size - 1, 1, "torn")):
+        block = bytearray(case.block.encode(case.example))
+        block[2 * at : 2 * at + 2] = word.to_bytes(2, "big")
+        with pytest.raises(ValueError, match=words):
+            case.block.decode(bytes(block))
+    with pytest.raises(ValueError, match=f"{case.size} registers, got 4"):
+        case.block.decode(bytes(8))
+
+
+@EACH
+@pytest.mark.parametrize("function", [3, 4])
+def test_clients_read_all_of_it_or_a_part(name: str, function: int) -> None:
+    case, responder, made = CASES[name], Responder(), list[Any]()
+
+    def encoder(block: Any) -> Any:
+        return lambda: made.append(block) or block.encode(case.example)
+
+    def ask(address: int, count: int) -> bytes:
+        return responder.answer(struct.pack(">HHHBBHH", 7, 0, 6, 1, function, address, count))
+
+    block, (at, count) = case.block.encode(case.example), case.part
+    shown = BLOCKS[: BLOCKS.index(case.block) + 1]
+    mirror = registers.encode_mirror(case.example)
+    responder.show(registers.encode_block(case.example), lambda: mirror, *map(encoder, shown))
+    assert ask(0, 64)[9:] == registers.encode_block(case.example)
+    assert not made, "a block is encoded when a client reads it"
+    assert ask(case.address, case.size)[9:] == block
+    assert ask(at, count)[9:] == block[2 * (at - case.address) : 2 * (at - case.address + count)]
+    assert made == [case.block], "once a snapshot, however often it is read"
+    for address, registers_asked in case.refused:
+        assert ask(address, registers_asked)[7:] == bytes([function | 0x80, 2])
+
+
+def layout(points: Layout) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": p.name, "offset": offset, "type": p.wire.name, "per_unit": p.per_unit, "unit": p.unit,
+            "rule": p.rule.value, "not_known": p.wire.not_known if p.can_be_unknown else None,
+        }
+        for offset, p in zip(points.offsets, points.points, strict=True)
+    ]  # fmt: skip
+
+
+@EACH
+def test_the_contract_is_the_frozen_one(name: str) -> None:
+    """A published layout is never edited: some names may be appended, anything else needs a new version."""
+    case, block = CASES[name], CASES[name].block
+    frozen = json.loads((FROZEN / f"{name}_v{block.version}.json").read_text())
+    now = {"version": block.version, "magic": block.magic, "address": block.address, "registers": block.registers}
+    now |= {"block": layout(block), **case.numbers}
+    if case.tail:
+        now |= {"datagram_from": case.tail[1], "tail": layout(case.tail[0])}
+    for key in case.appended:
+        before, after = frozen.pop(key), now.pop(key)
+        kept = after[: len(before)] if isinstance(after, list) else {name: after.get(name) for name in before}
+        assert kept == before
+    assert now == frozen
+    assert (registers.TAIL_OFFSET, registers.TRUST_OFFSET) == (128, 152)
+
+
+@EACH
+def test_the_pages_name_each_place(name: str) -> None:
+    case, modbus, udp = CASES[name], document.modbus_page(), document.udp_page()
+    for offset, point in zip(case.block.offsets, case.block.points, strict=True):
+        if not point.name.startswith("link_") or point.name.startswith("link_1_"):
+            assert f"| {case.address + 2 + offset} | `{point.name}` | {point.wire.name} |" in modbus
+    if case.tail:
+        for offset, point in zip(case.tail[0].offsets, case.tail[0].points, strict=True):
+            assert f"| {case.tail[1] + 2 * offset} | `{point.name}` | {point.wire.name} |" in udp
+
+
+def test_the_page_places_all_links() -> None:
+    names = [point.name for point in lights_block.BLOCK.points]
+    assert lights_block.BLOCK.offsets[names.index("link_3_code")] == 222 - 202 + 12
+    assert "begins at 222 + 6 (k - 1)" in document.modbus_page()
