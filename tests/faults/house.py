@@ -35,10 +35,10 @@ from hal.net.inputs import InputPort
 from tools.sim.ceiling.ceiling import Effects
 from tools.sim.ceiling.effects import IDEAL
 from tools.sim.harness import DEVICE, world
-from tools.sim.light.harness import BUS, light_up, lights_of
 from tools.sim.light.scene import Lights
-from tools.sim.odometry import Wheels
-from tools.sim.robot import Body
+from tools.sim.light_harness import BUS, light_up, lights_of
+from tools.sim.robot.drive import Body
+from tools.sim.robot.odometry import Wheels
 from tools.sim.scene import Scenario, SimulatedScene
 
 LIDAR: Final[LidarModel] = replace(UTM_30LX, ares=480, amin=0, amax=360, afrt=180, rpm=600, true_period_s=0.1002)

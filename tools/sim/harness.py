@@ -33,9 +33,9 @@ from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inputs import InputPort
 from tools.sim.building.world import Array
 from tools.sim.feed import feed_odometry
-from tools.sim.hands import Hands
-from tools.sim.light.harness import BUS, LEVEL, LinkBridge, light_up, lights_of
 from tools.sim.light.scene import LINK
+from tools.sim.light_harness import BUS, LEVEL, LinkBridge, light_up, lights_of
+from tools.sim.robot.hands import Hands
 from tools.sim.scene import Scenario, Scene, SimulatedScene
 
 DEVICE: Final = "/dev/simulated"
@@ -99,7 +99,7 @@ def run(
         scenario: the simulated scene; default the paper's robot in the paper's room.
         scene: another scene, instead of a scenario.
         faults: TOML schedule of faults of the lidar and, with lights, of the converter (``adc``), and of being carried
-            (``robot``, see tools/sim/hands.py).
+            (``robot``, see tools/sim/robot/hands.py).
         odometry: whether wheel odometry is fed.
         lidar: whether there is a lidar; without one, lights must be in the scenario.
         record: folder for a recording of the run; light has to come as words of the converter.

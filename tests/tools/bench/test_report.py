@@ -12,9 +12,10 @@ from xml.etree import ElementTree
 import pytest
 
 from daemon.system.versions import versions
-from tools.bench.against import CannotCompare, Compared, read, regressions
-from tools.bench.plots import Plot, Series, histogram, svg
-from tools.bench.report import About, CannotReport, Figure, Result, demand_apart, demand_room, facts, junit, page, write
+from tools.bench.report.against import CannotCompare, Compared, read, regressions
+from tools.bench.report.page import CannotReport, demand_apart, demand_room, facts, junit, page, write
+from tools.bench.report.plots import Plot, Series, histogram, svg
+from tools.bench.report.result import About, Figure, Result
 
 NOISE = Figure("noise", 10.0, "mm", "more")
 GOOD = Result("boots", "Debian boots", True, 20.0, "up after 20 s", figures=(NOISE,))

@@ -24,7 +24,7 @@ from tests.rotation import share
 from tools.demo.acts import ROBOT, Act, OrderRefused, Stage, complaint, programme
 from tools.demo.run import free_port, line, links, write_config
 from tools.demo.score import Score, Track, cause, in_map, summary, verdict
-from tools.sim.robot import Body
+from tools.sim.robot.drive import Body
 
 
 def reading(state: State = State.TRACKING, pose: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Any:

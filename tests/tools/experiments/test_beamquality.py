@@ -7,7 +7,7 @@ import pytest
 
 from tools.bench.support.scenes import office
 from tools.experiments import beamquality as bq
-from tools.experiments.report import Work
+from tools.experiments.support.report import Work
 
 
 def test_the_area_is_that_under_the_curve() -> None:

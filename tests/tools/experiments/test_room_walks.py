@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from tools.experiments import room, walks
-from tools.experiments.report import Work
+from tools.experiments import room
+from tools.experiments.recorded import walks
+from tools.experiments.support.report import Work
 
 
 def test_scores_of_a_known_trace() -> None:

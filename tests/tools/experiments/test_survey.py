@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tools.experiments import survey
-from tools.experiments.report import Work
+from tools.experiments.support.report import Work
 
 
 @pytest.mark.slow

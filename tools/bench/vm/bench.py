@@ -20,11 +20,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from tools.bench.system.otherclock import OtherClock
+from tools.bench.support.children import LEASH
+from tools.bench.support.other_clock import OtherClock
 from tools.bench.vm.booted import Booted
 from tools.bench.vm.image import ROOT
 from tools.bench.vm.machine import OUTSIDE, Machine, Order, Ports, free_for_both, free_port, started
-from tools.bench.vm.places import LEASH, CannotBench
+from tools.bench.vm.places import CannotBench
 from tools.clients.read_modbus import Reader
 
 UNIT: Final = "lumiloop.service"

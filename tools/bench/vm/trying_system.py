@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from tools.bench.plots import Plot, Series, histogram
-from tools.bench.report import Figure, Seen
+from tools.bench.report.plots import Plot, Series, histogram
+from tools.bench.report.result import Figure, Seen
 from tools.bench.vm.bench import CONFIG, DONE, PLACED, SAVE_MAP, UNIT, Bench, Heard, inverse_then
 from tools.bench.vm.common import (
     BUDGET,

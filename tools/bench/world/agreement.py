@@ -16,8 +16,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from tools.bench.plots import Plot, Series
-from tools.bench.report import Figure
+from tools.bench.report.plots import Plot, Series
+from tools.bench.report.result import Figure
 from tools.bench.world.judge import Errors, Played, errors_of, seen_from
 from tools.bench.world.scenario import Scenario
 from tools.sim.harness import run

@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from tools.bench.plots import Plot, Series, histogram
-from tools.bench.report import Figure, Seen
+from tools.bench.report.plots import Plot, Series, histogram
+from tools.bench.report.result import Figure, Seen
 from tools.bench.world.scenario import GAP_S, Expectation, Scenario
 from tools.clients.read_modbus import STATES
-from tools.sim.robot import Body
+from tools.sim.robot.drive import Body
 
 Array = npt.NDArray[np.float64]
 Pose = tuple[float, float, float]

@@ -24,8 +24,8 @@ from tools.experiments.integrity import run as integrity_run
 from tools.experiments.integrity.plot import stanford
 from tools.experiments.integrity.report import Summary, report
 from tools.experiments.integrity.scene import KINDS, draw
-from tools.experiments.report import COMMAND, Picture, Report, Table, Work, code
-from tools.experiments.report import draw as pictured
+from tools.experiments.support.report import COMMAND, Picture, Report, Table, Work, code
+from tools.experiments.support.report import draw as pictured
 
 OUT: Final = Path("out/integrity")
 SEEDS: Final = 60

@@ -33,7 +33,7 @@ from tools.experiments.paper_figures.fig6_curves import (
 )
 from tools.experiments.paper_figures.fig6_trial import COVERED, LASER, LIT, Drive, stored
 from tools.experiments.paper_figures.fig6_truth import STRICT
-from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work, code
+from tools.experiments.support.report import COMMAND, Cell, Picture, Report, Table, Work, code
 
 SEEDS: Final = tuple(range(1, 52))
 KEPT: Final = Path("out/experiments")
@@ -41,7 +41,7 @@ SOURCES: Final = (
     "estimator/**/*.py",
     "tools/sim/**/*.py",
     "tools/experiments/fig6_tr*.py",
-    "tools/experiments/loop_drives.py",
+    "tools/experiments/support/loop_drives.py",
 )
 LENGTH_M: Final = 80.0
 WAYS: Final = (LIT, LASER, COVERED)

@@ -24,9 +24,9 @@ from estimator.measurements import LightEpoch
 from estimator.numerics import se2
 from estimator.pipeline import Settings, State, new_state
 from estimator.result import StepResult
-from tools.experiments.loop_drives import half, play, room_drive, scans
 from tools.experiments.paper_figures.fig6_truth import Truth
-from tools.experiments.trajectory import Errors, Track, errors, started
+from tools.experiments.support.loop_drives import half, play, room_drive, scans
+from tools.experiments.support.trajectory import Errors, Track, errors, started
 from tools.sim.building.world import Array
 from tools.sim.light.link_drive import ROOM_WALKERS, LightRun
 

@@ -25,7 +25,7 @@ from tools.ci.figures import Figure, bounded
 from tools.experiments.relocation.maps import kept_map
 from tools.experiments.relocation.trial import Case, Outcome, trial
 from tools.experiments.relocation.worlds import Place, Site, lit_house, symmetric_room
-from tools.experiments.report import COMMAND, Cell, Report, Table, Work, code
+from tools.experiments.support.report import COMMAND, Cell, Report, Table, Work, code
 from tools.sim.ceiling.ceiling import Effects
 
 FOLDER: Final = Path("out/experiments/relocate")

@@ -33,7 +33,7 @@ from tools.ci.figures import Figure, bounded
 from tools.experiments.relocation.maps import pickled, unpickled
 from tools.experiments.relocation.relocate import FOLDER, at_most, digest, keep, kept_outcomes
 from tools.experiments.relocation.trial import Case, Moment, Outcome, Robot, outcome, switched_on
-from tools.experiments.report import COMMAND, Report, Skipped, Table, Work
+from tools.experiments.support.report import COMMAND, Report, Skipped, Table, Work
 from tools.sim.building.world import Plan
 from tools.sim.ceiling.ceiling import Ceiling, Effects
 from tools.sim.ceiling.lamps import Fixture, with_codes

@@ -22,8 +22,8 @@ import pytest
 from daemon.health.faults import Fault
 from daemon.publish.modbus import parts_block, registers
 from daemon.snapshot import NO_CONDITION
+from tools.bench.support.other_clock import OtherClock
 from tools.bench.system.modbus import example
-from tools.bench.system.otherclock import OtherClock
 from tools.bench.vm import __main__ as command
 from tools.bench.vm import bench, image, places, reference, trying_system, whole, world
 from tools.bench.vm.__main__ import chosen

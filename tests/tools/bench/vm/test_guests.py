@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tools.bench.plots import Plot
-from tools.bench.report import Figure, Seen
+from tools.bench.report.plots import Plot
+from tools.bench.report.result import Figure, Seen
 from tools.bench.vm import bench, common, guests, places
 from tools.bench.vm.booted import Booted
 from tools.bench.vm.guests import Guest, Turns, run_all, tried

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tools.bench.report import About, Figure, Result, Seen, write
+from tools.bench.report.page import write
+from tools.bench.report.result import About, Figure, Result, Seen
 from tools.bench.vm import __main__ as command
 from tools.bench.vm import common, trying_process, trying_system
 from tools.bench.vm.bench import Bench, Ears, Heard

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tools.bench.report import Seen
+from tools.bench.report.result import Seen
 from tools.bench.vm import bench as benches
 from tools.bench.vm import common, places, trying_devices, trying_system
 from tools.bench.vm.bench import Bench, Heard

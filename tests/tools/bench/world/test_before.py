@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from daemon.config.loader import load as load_config
-from tools.bench.report import About, Figure, Result, write
+from tools.bench.report.page import write
+from tools.bench.report.result import About, Figure, Result
 from tools.bench.world import __main__ as world
 from tools.bench.world.__main__ import main
 from tools.bench.world.judge import Read

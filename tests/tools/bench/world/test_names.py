@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.bench.report import Figure, Result
+from tools.bench.report.result import Figure, Result
 from tools.bench.world import __main__ as world
 from tools.bench.world.__main__ import main
 from tools.bench.world.scenario import Scenario, ScenarioError, load

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from daemon.runtime import warmup
-from tools.bench.report import Result
+from tools.bench.report.result import Result
 from tools.bench.world import __main__ as world
 from tools.bench.world import local
 from tools.bench.world.stage import CannotPlay, Ends

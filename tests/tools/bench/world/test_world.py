@@ -24,7 +24,7 @@ from hal.errors import DeviceMissing
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.scan_world import Room
 from tests.hil.programs import served_receiver
-from tools.bench.report import Result, Seen
+from tools.bench.report.result import Result, Seen
 from tools.bench.world import __main__ as world
 from tools.bench.world import agreement, room
 from tools.bench.world.__main__ import main, twins

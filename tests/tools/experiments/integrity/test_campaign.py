@@ -13,7 +13,7 @@ from tools.experiments.integrity import campaign
 from tools.experiments.integrity.report import COLUMNS, Array, Summary, judged, longest, report
 from tools.experiments.integrity.run import run, scans
 from tools.experiments.integrity.scene import KINDS, draw
-from tools.experiments.report import draw as draw_pictures
+from tools.experiments.support.report import draw as draw_pictures
 
 AT = {name: number for number, name in enumerate(COLUMNS)}
 

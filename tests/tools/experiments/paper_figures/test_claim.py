@@ -26,7 +26,7 @@ from tools.experiments.paper_figures.claim_pairs import (
     returns,
     way_of,
 )
-from tools.experiments.report import Work
+from tools.experiments.support.report import Work
 
 ROOM = Condition("room", "room", 0.5, GOOD)
 

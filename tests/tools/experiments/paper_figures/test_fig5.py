@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.experiments import outings
 from tools.experiments.paper_figures import fig5
-from tools.experiments.report import Work, save
-from tools.experiments.trajectory import Track, errors, fitted, moved, started
+from tools.experiments.support import outings
+from tools.experiments.support.report import Work, save
+from tools.experiments.support.trajectory import Track, errors, fitted, moved, started
 from tools.sim.ceiling.ceiling import paper_ceiling
 
 

@@ -14,14 +14,14 @@ from estimator.mapping.keyframe import keep
 from estimator.measurements import Beam, Scan
 from estimator.numerics import se2
 from tools.experiments import islands
-from tools.experiments.loop_drives import HOME, room_drive, room_route
 from tools.experiments.paper_figures import fig6
 from tools.experiments.paper_figures.fig6_curves import Point, accepted, best, counted, point, right, rule
 from tools.experiments.paper_figures.fig6_trial import LASER, LIT, Detection, Drive, Way, stored
 from tools.experiments.paper_figures.fig6_truth import Truth
-from tools.experiments.report import Work, save
-from tools.experiments.trajectory import Errors
-from tools.sim.robot import smooth
+from tools.experiments.support.loop_drives import HOME, room_drive, room_route
+from tools.experiments.support.report import Work, save
+from tools.experiments.support.trajectory import Errors
+from tools.sim.robot.drive import smooth
 
 GOOD = Detection(1, 1, False, 0.9, 0.0, 0.007, True, 1.0, 1.0, 0.01, 0.001, True, (0.0, 0.0, 0.0))
 MIRROR = replace(GOOD, off_m=8.5, off_rad=math.pi, positive=False, light=9000.0, place=(8.0, 0.0, 3.0))

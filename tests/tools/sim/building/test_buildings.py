@@ -12,7 +12,7 @@ from tools.sim.building.buildings import BUILDINGS, building, corridor_loop
 from tools.sim.building.office import DOOR, office_floor
 from tools.sim.building.people import KEEP_AWAY_M, Crowd, Walker
 from tools.sim.building.world import CIRCLE, MATERIAL_ID, Array, Plan
-from tools.sim.robot import Body, Drive
+from tools.sim.robot.drive import Body, Drive
 
 
 @pytest.mark.parametrize("name", sorted(BUILDINGS))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tools.sim.building.doors import Kind, doors
-from tools.sim.robot import Body, Drive
+from tools.sim.robot.drive import Body, Drive
 
 
 @pytest.mark.parametrize("width", [2.6, 5.0])

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tools.sim.building.buildings import BUILDINGS, Building, building
+from tools.sim.building.building import Building
+from tools.sim.building.buildings import BUILDINGS, building
 from tools.sim.building.world import Plan
 from tools.sim.ceiling import optics
 from tools.sim.ceiling.ceiling import IDEAL, Ceiling, Effects, ceiling_of, paper_ceiling
 from tools.sim.ceiling.lamps import Fixture, fixtures
 from tools.sim.ceiling.movers import rows_of
-from tools.sim.robot import Route
+from tools.sim.robot.drive import Route
 
 ROOM = (-5.0, -5.0, 5.0, 5.0)
 

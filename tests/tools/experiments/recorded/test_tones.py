@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.experiments import tones
-from tools.experiments.report import Work
-from tools.experiments.vlp import Raw
+from tools.experiments.recorded import tones
+from tools.experiments.recorded.vlp import Raw
+from tools.experiments.support.report import Work
 
 RATE = 2000.0
 

@@ -9,22 +9,22 @@ from __future__ import annotations
 import contextlib
 import html
 import json
-import math
 import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 from xml.etree import ElementTree
 
 from daemon.config.paths import can_be_made
 from daemon.system.versions import versions
-from tools.bench.against import Before, Compared, Old, compare
-from tools.bench.plots import Plot, svg
+from tools.bench.report.against import Before, Compared, Old, compare
+from tools.bench.report.plots import svg
+from tools.bench.report.result import About, Result
 
-ROOT: Final = Path(__file__).parents[2]
+ROOT: Final = Path(__file__).parents[3]
 FILES: Final = ("junit.xml", "report.html", "results.json")
 SLOWER: Final = 1.5
 """What takes this many times as long as in the run compared with is marked in the page, and no worse for it: a figure
@@ -33,75 +33,6 @@ tells of what is tested, seconds tell of the machine around it, too."""
 
 class CannotReport(Exception):
     """Nothing can be written where the report is to go; the text says so."""
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """A number that was measured.
-
-    Attributes:
-        worse: which way is worse; empty: neither, it is only told. share: by how much it may be worse than in another
-            run, as a share of the value then. room: and by so much in its own unit besides.
-    """
-
-    name: str
-    value: float
-    unit: str = ""
-    worse: Literal["more", "less", ""] = ""
-    share: float = 0.25
-    room: float = 0.0
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.value:.4g} {self.unit}".rstrip()
-
-    def lost(self, old: float) -> bool:
-        """Whether it is worse than it was then; what could not be measured any more is."""
-        if math.isnan(self.value):
-            return bool(self.worse) and not math.isnan(old)
-        allowed = self.share * abs(old) + self.room
-        return {"more": self.value > old + allowed, "less": self.value < old - allowed, "": False}[self.worse]
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """Of one thing that was tried: its name, title, whether it passed, seconds, what was seen or what was wrong.
-
-    Attributes:
-        skipped: why it was not tried; empty: it was. fake: it was tried on a fake, and says nothing of a device.
-    """
-
-    name: str
-    title: str
-    passed: bool
-    seconds: float
-    said: str
-    skipped: str = ""
-    figures: tuple[Figure, ...] = ()
-    plots: tuple[Plot, ...] = ()
-    fake: bool = False
-
-    @property
-    def outcome(self) -> str:
-        """In a word."""
-        return "skipped" if self.skipped else "passed" if self.passed else "FAILED"
-
-
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """What one thing that passed has shown."""
-
-    said: str
-    figures: tuple[Figure, ...] = ()
-    plots: tuple[Plot, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class About:
-    """Whose report it is: the bench's name (``bench-vm``), its title, and facts of the run by name."""
-
-    name: str
-    title: str
-    facts: dict[str, str]
 
 
 def facts(**more: str) -> dict[str, str]:

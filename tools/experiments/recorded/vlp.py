@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from tools.experiments.report import Skipped
+from tools.experiments.support.report import Skipped
 
 Array = npt.NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from estimator.light_filter.lambertian import expected
-from tools.experiments import static
-from tools.experiments.static import Taught
-from tools.experiments.vlp import STATIC_LAMPS, Campaign
+from tools.experiments.recorded import static
+from tools.experiments.recorded.static import Taught
+from tools.experiments.recorded.vlp import STATIC_LAMPS, Campaign
 
 
 @pytest.fixture

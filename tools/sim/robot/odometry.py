@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
-from tools.sim.building.world import Array, World
-from tools.sim.robot import Drive
+from tools.sim.robot.drive import Array, Drive
 
 _BLOCK: Final = 512
+
+
+class Ground(Protocol):
+    """The ground on which wheels slip."""
+
+    def polished_at(self, points: Array) -> npt.NDArray[np.bool_]:
+        """Whether each point (n, 2) in m lies on a polished part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +45,9 @@ class Wheels:
 class Odometer:
     """Cumulative odometry readings of one drive, reading ``k`` true at ``k / rate_hz``; same seed, same slip."""
 
-    def __init__(self, drive: Drive, world: World, wheels: Wheels, seed: int = 0) -> None:
+    def __init__(self, drive: Drive, ground: Ground, wheels: Wheels, seed: int = 0) -> None:
         self.wheels = wheels
-        self._drive, self._world, self._seed = drive, world, seed
+        self._drive, self._ground, self._seed = drive, ground, seed
         rng = np.random.default_rng((seed, 0))
         self.scale = 1.0 + wheels.scale * rng.standard_normal(2)
         self.base = drive.body.wheel_base * (1.0 + wheels.base_scale * rng.standard_normal())
@@ -79,7 +86,7 @@ class Odometer:
         wheels = self.wheels
         rng = np.random.default_rng((self._seed, 1 + self._block))
         errors = wheels.noise * np.sqrt(np.abs(moved)) * rng.standard_normal(moved.shape)
-        rate = wheels.slips_per_m * np.where(self._world.polished_at(at), wheels.polish, 1.0)
+        rate = wheels.slips_per_m * np.where(self._ground.polished_at(at), wheels.polish, 1.0)
         slips = rng.random(len(ds)) < rate * ds
         size = rng.exponential(wheels.slip_m, len(ds)) * np.where(rng.random(len(ds)) < 0.75, 1.0, -1.0)
         side = rng.integers(0, 2, len(ds))

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
-from tools.sim.building.world import Array
+Array = npt.NDArray[np.float64]
+
 
 STEP_M: Final = 0.01
 SHARP_RAD: Final = 0.075
@@ -173,3 +175,10 @@ def _speeds(s: Array, curvature: Array, body: Body) -> Array:
     squared = np.minimum.accumulate(v**2 - ramp) + ramp
     squared = np.minimum.accumulate((squared + ramp)[::-1])[::-1] - ramp
     return np.sqrt(np.maximum(squared, 0.0))
+
+
+def compose(poses: Array, offset: tuple[float, float, float]) -> Array:
+    """(n, 3) poses, each followed by the same planar transform."""
+    x, y, yaw = offset
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return np.column_stack([poses[:, 0] + c * x - s * y, poses[:, 1] + s * x + c * y, poses[:, 2] + yaw])

@@ -26,8 +26,8 @@ from estimator.light_filter.survey import Lamp, Receiver, Survey
 from estimator.measurements import Imu
 from estimator.result import Fix
 from tools.ci.figures import Figure, bounded
-from tools.experiments.report import COMMAND, Picture, Report, Table, Work
-from tools.experiments.vlp import Walk, walk
+from tools.experiments.recorded.vlp import Walk, walk
+from tools.experiments.support.report import COMMAND, Picture, Report, Table, Work
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

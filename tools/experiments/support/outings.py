@@ -21,14 +21,14 @@ from estimator.paper import LUMILOOP, method
 from estimator.paper.methods import Method
 from estimator.pipeline import Settings, State, keyframe_poses
 from estimator.result import Fix, StepResult
-from tools.experiments.trajectory import Array, Track, moved
+from tools.experiments.support.trajectory import Array, Track, moved
 from tools.sim.building.buildings import building
 from tools.sim.building.people import Walker
 from tools.sim.ceiling.ceiling import Ceiling
 from tools.sim.ceiling.movers import lean_of, walkers_of
 from tools.sim.ceiling.records import epochs
 from tools.sim.light.link_drive import ROOM_ROUTE, ROOM_WALKERS, LightRun, room_run, tour_run
-from tools.sim.robot import Drive
+from tools.sim.robot.drive import Drive
 from tools.sim.scan_drive import Laser
 
 AT_ONCE_S: Final = 1e-6

@@ -25,8 +25,8 @@ from estimator.light_filter.residual_lookup import look_up
 from estimator.light_filter.residual_map import ResidualMap
 from estimator.light_filter.survey import Lamp, Receiver, Survey
 from tools.ci.figures import Figure, bounded
-from tools.experiments.report import COMMAND, Picture, Report, Table, Work
-from tools.experiments.vlp import Campaign, campaign
+from tools.experiments.recorded.vlp import Campaign, campaign
+from tools.experiments.support.report import COMMAND, Picture, Report, Table, Work
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]

@@ -1,6 +1,6 @@
 """Pictures of buildings, drives and scans, for people (needs matplotlib, extra ``plot``).
 
-``python -m tools.sim.draw paper_room out.png`` draws a building, its tour and a few scans along it.
+``python -m tools.sim.building.draw paper_room out.png`` draws a building, its tour and a few scans along it.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from typing import Any, Final
 import numpy as np
 
 from tools.sim.building.beams import UTM_30LX, Posture, Scanner, Sweep
-from tools.sim.building.buildings import BUILDINGS, Building, building
+from tools.sim.building.building import Building
+from tools.sim.building.buildings import BUILDINGS, building
 from tools.sim.building.people import Crowd
 from tools.sim.building.world import CIRCLE, MATERIAL_ID, Array
-from tools.sim.robot import Body, Drive
+from tools.sim.robot.drive import Body, Drive
 
 COLOURS: Final = {"glass": "deepskyblue", "black": "black", "steel": "tab:gray", "wood": "peru", "polished": "tab:pink"}
 
@@ -85,4 +86,4 @@ def asked(program: str, about: str) -> tuple[str, str]:
 
 
 if __name__ == "__main__":
-    main(*asked("tools.sim.draw", __doc__))
+    main(*asked("tools.sim.building.draw", __doc__))

@@ -12,7 +12,7 @@ import pytest
 from tools.ci.figures import bounded
 from tools.experiments import __main__ as program
 from tools.experiments.paper_figures import table1
-from tools.experiments.report import Picture, Report, Skipped, Table, Work, draw, save
+from tools.experiments.support.report import Picture, Report, Skipped, Table, Work, draw, save
 
 
 def square(x: int) -> int:

@@ -20,8 +20,7 @@ from tools.sim.building.beams import UTM_30LX, Posture, Scanner, Sweep
 from tools.sim.building.people import Crowd, Walker
 from tools.sim.ceiling.movers import lean_of
 from tools.sim.light.link_drive import LightRun, room_run
-from tools.sim.robot import Body, Drive, Route
-from tools.sim.scene import compose
+from tools.sim.robot.drive import Body, Drive, Route, compose
 
 BEARING: Final = np.radians(np.linspace(-90.0, 90.0, 181))
 RATE_HZ: Final = 10.0

@@ -13,8 +13,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from hal.fake.faults.orders import Fault, Parameter, Vocabulary, Word
-from tools.sim.building.world import Array
-from tools.sim.robot import Drive
+from tools.sim.robot.drive import Array, Drive
 
 VOCABULARY: Final[Vocabulary] = {
     "carry": Word(

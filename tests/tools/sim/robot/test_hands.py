@@ -7,9 +7,9 @@ import pytest
 
 from hal.fake.faults.orders import FaultError, read_fault
 from hal.fake.lidar.models import UTM_30LX
-from tools.sim.hands import VOCABULARY, Hands, Way, start_of, then
-from tools.sim.odometry import Wheels
-from tools.sim.robot import Body, Drive, Route
+from tools.sim.robot.drive import Body, Drive, Route
+from tools.sim.robot.hands import VOCABULARY, Hands, Way, start_of, then
+from tools.sim.robot.odometry import Wheels
 from tools.sim.scene import Scenario, SimulatedScene
 
 SQUARE = Route(((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)))

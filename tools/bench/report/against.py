@@ -7,12 +7,11 @@ import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import msgspec
 
-if TYPE_CHECKING:
-    from tools.bench.report import Result
+from tools.bench.report.result import Result
 
 NAMED: Final = 6
 """So many names of what cannot be compared are told."""

@@ -21,9 +21,9 @@ from estimator.cdma.joint_fit_kernels import reduce_rows
 from estimator.cdma.mains_rejection import basis, orthonormal
 from estimator.cdma.sample_block import Sampled
 from tools.ci.figures import Figure
-from tools.experiments import vlp
-from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
-from tools.experiments.vlp import Array, Raw
+from tools.experiments.recorded import vlp
+from tools.experiments.recorded.vlp import Array, Raw
+from tools.experiments.support.report import COMMAND, Cell, Picture, Report, Table, Work
 
 HARMONICS: Final = (1, 2, *range(3, 42, 2))
 """Lamps switched with equal on and off times have odd harmonics; the second shows how equal these are."""

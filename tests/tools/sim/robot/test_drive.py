@@ -9,8 +9,8 @@ import pytest
 
 from tools.sim.building.buildings import BUILDINGS, building
 from tools.sim.building.world import Array, Plan
-from tools.sim.odometry import Odometer, Wheels
-from tools.sim.robot import Body, Drive, Route
+from tools.sim.robot.drive import Body, Drive, Route
+from tools.sim.robot.odometry import Odometer, Wheels
 
 BODY = Body()
 SQUARE = Route(((2.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0), (0.0, 0.0)))

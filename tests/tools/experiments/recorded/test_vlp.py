@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.experiments import vlp
-from tools.experiments.report import Skipped
+from tools.experiments.recorded import vlp
+from tools.experiments.support.report import Skipped
 
 
 def spread_of_power_law(places: vlp.Array, lamps: vlp.Array, rss: vlp.Array) -> vlp.Array:
