@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from daemon.cli import parser
+from daemon.replay import convert
 from hal.lidar import VALID, RawScan
 from hal.odometry import RawOdometry
 from hal.replay.carmen import CarmenLog, read_carmen
-from tools import convert
 
 RNG = np.random.default_rng(3)
 
@@ -43,7 +44,7 @@ def scans_of(log: CarmenLog) -> list[RawScan]:
 @pytest.mark.parametrize("name", ["a.dat", "a.dat.gz"])
 def test_every_range_of_a_dat_file_comes_out_of_the_log(tmp_path: Path, name: str) -> None:
     ranges = write_dat(tmp_path / name)
-    assert convert.main([str(tmp_path / name), str(tmp_path / "b.log.gz"), "--all", "--logged"]) == 0
+    assert parser.main(["convert", str(tmp_path / name), str(tmp_path / "b.log.gz"), "--all", "--logged"]) == 0
     log = read_carmen(tmp_path / "b.log.gz")
     assert not log.report.skipped
     assert log.mount == pytest.approx((0.145, 0.0, 0.0), abs=1e-6)
@@ -59,7 +60,7 @@ def test_every_range_of_a_dat_file_comes_out_of_the_log(tmp_path: Path, name: st
 
 def test_beams_that_see_the_rover_and_far_ranges_go_by_default(tmp_path: Path) -> None:
     ranges = write_dat(tmp_path / "a.dat")
-    assert convert.main([str(tmp_path / "a.dat"), str(tmp_path / "b.log")]) == 0
+    assert parser.main(["convert", str(tmp_path / "a.dat"), str(tmp_path / "b.log")]) == 0
     found = np.array([scan.ranges for scan in scans_of(read_carmen(tmp_path / "b.log"))])
     kept = np.zeros_like(ranges, dtype=bool)
     kept[:, 70:612] = True
@@ -110,7 +111,7 @@ def write_npz(path: Path, **changes: object) -> npt.NDArray[np.uint16]:
 
 def test_an_npz_becomes_a_log_without_wheels(tmp_path: Path) -> None:
     ranges = write_npz(tmp_path / "a.npz")
-    assert convert.main([str(tmp_path / "a.npz"), str(tmp_path / "b.log")]) == 0
+    assert parser.main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.log")]) == 0
     log = read_carmen(tmp_path / "b.log")
     found = scans_of(log)
     assert np.array_equal([scan.ranges for scan in found], np.where(ranges >= 23, ranges, 0))
@@ -139,10 +140,10 @@ def test_what_cannot_be_converted_is_named(
     path = tmp_path / "a.dat"
     if content is not None:
         path.write_bytes(content)
-    assert convert.main([str(path), str(tmp_path / "b.log")]) == 1
+    assert parser.main(["convert", str(path), str(tmp_path / "b.log")]) == 1
     with pytest.raises(convert.NotConverted, match=says):
         convert.read(path)
-    assert "convert: " in capsys.readouterr().err
+    assert "lumiloop: " in capsys.readouterr().err
     assert not (tmp_path / "b.log").exists()
 
 
@@ -157,7 +158,7 @@ def test_an_npz_of_another_shape(tmp_path: Path) -> None:
 
 def test_an_output_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_dat(tmp_path / "a.dat", 3)
-    assert convert.main([str(tmp_path / "a.dat"), str(tmp_path / "none" / "b.log")]) == 1
+    assert parser.main(["convert", str(tmp_path / "a.dat"), str(tmp_path / "none" / "b.log")]) == 1
     assert "No such file" in capsys.readouterr().err
 
 
@@ -169,7 +170,7 @@ def test_the_real_rover_logs(log_root: Path, tmp_path: Path) -> None:
         assert scans.ranges.shape == (count, 682)
         assert np.hypot(*np.diff(scans.poses[:, :2], axis=0).T).sum() == pytest.approx(way, abs=0.1)
         periods.append(scans.laser.period)
-        assert convert.main([str(source), str(tmp_path / "a.log"), "--all"]) == 0
+        assert parser.main(["convert", str(source), str(tmp_path / "a.log"), "--all"]) == 0
         log = read_carmen(tmp_path / "a.log")
         logged = convert.read(source).ranges
         assert np.array_equal([s.ranges for s in scans_of(log)], np.where((logged >= 20) & (logged <= 5600), logged, 0))
@@ -179,7 +180,7 @@ def test_the_real_rover_logs(log_root: Path, tmp_path: Path) -> None:
 
 
 def test_the_real_utm_log(log_root: Path, tmp_path: Path) -> None:
-    assert convert.main([str(log_root / "utm30lx" / "scans.npz"), str(tmp_path / "a.log.gz")]) == 0
+    assert parser.main(["convert", str(log_root / "utm30lx" / "scans.npz"), str(tmp_path / "a.log.gz")]) == 0
     log = read_carmen(tmp_path / "a.log.gz")
     assert len(log.stamps) == 885
     with np.load(log_root / "utm30lx" / "scans.npz") as data:

@@ -1,8 +1,6 @@
-"""Turns recorded lidar data of other formats into CARMEN logs that `lumiloop replay` reads.
+"""Recorded lidar data of other formats as CARMEN logs that `lumiloop replay` reads.
 
-    python -m tools.convert IN OUT [--logged] [--delay S] [--all]
-
-``IN`` is recognised by its content:
+The input is recognised by its content:
 
 * the ``.dat`` files of CoreSLAM/BreezySLAM (``.gz`` too): a HOKUYO URG-04LX on a rover with wheel encoders, one scan a
   line: [0] time in us, [2] [3] encoder counts left and right, [24..705] 682 ranges in mm from step 44 to 725, 0 where
@@ -10,16 +8,14 @@
 * an ``.npz`` with ``t_device_s``, ``range_mm``, ``angle_min_rad``, ``angle_increment_rad``, ``time_increment_s``: scans
   of a HOKUYO UTM-30LX.
 
-``OUT`` gets ROBOTLASER1 lines with start angle, field of view and resolution, and PARAM lines for what such a line
+The log gets ROBOTLASER1 lines with start angle, field of view and resolution, and PARAM lines for what such a line
 cannot say: the mount, the model, its ranges, the time of a revolution and between beams.
 """
 
 from __future__ import annotations
 
-import argparse
 import gzip
 import math
-import sys
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -202,7 +198,7 @@ def write(path: Path, scans: Scans, source: str) -> None:
 def _lines(scans: Scans, source: str) -> Iterator[str]:
     laser, count = scans.laser, scans.ranges.shape[1]
     first = f"{scans.stamps[0]:.6f} convert 0"
-    yield f"# made from {source} by python -m tools.convert; see docs/data.md"
+    yield f"# made from {source} by lumiloop convert; see docs/data.md"
     yield from (f"PARAM {name} {value} {first}" for name, value in _parameters(laser).items())
     setup = f"0 {laser.start:.9f} {laser.step * (count - 1):.9f} {laser.step:.12f} {(laser.dmax + 1) / 1e3:.3f} 0.001 0"
     mount = laser.mount
@@ -231,27 +227,14 @@ def _parameters(laser: Laser) -> dict[str, str]:
     }
 
 
-def main(argv: list[str] | None = None) -> int:
-    """The command; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tools.convert", description=__doc__.split("\n")[0])
-    parser.add_argument("source", type=Path, metavar="IN", help="a .dat (.gz) or .npz file")
-    parser.add_argument("log", type=Path, metavar="OUT", help="the log to write, .log or .log.gz")
-    parser.add_argument("--logged", action="store_true", help="keep the host's stamps instead of the motor's turns")
-    parser.add_argument("--delay", type=float, default=DELAY_S, metavar="S", help="first beam to mean arrival, seconds")
-    parser.add_argument("--all", action="store_true", help="keep beams that see the rover and ranges beyond 4 m")
-    args = parser.parse_args(argv)
-    try:
-        scans = read(args.source)
-        if scans.laser.model == "URG-04LX":
-            scans = scans if args.logged else even_stamps(scans, args.delay)
-            scans = scans if args.all else trusted(scans, ROVER_HIDDEN_BEAMS, ROVER_TRUSTED_MM)
-        write(args.log, scans, args.source.name)
-    except NotConverted as error:
-        sys.stderr.write(f"convert: {error}\n")
-        return 1
-    sys.stderr.write(f"convert: {len(scans.stamps)} scans of {scans.ranges.shape[1]} beams into {args.log}\n")
-    return 0
+def convert(source: Path, log: Path, logged: bool = False, delay: float = DELAY_S, every: bool = False) -> Scans:
+    """Convert a file to a CARMEN log and return what was written; raises `NotConverted`.
 
-
-if __name__ == "__main__":
-    sys.exit(main())
+    Of a rover's log the scans get even stamps, unless ``logged``, and lose beams that see the rover, unless ``every``.
+    """
+    scans = read(source)
+    if scans.laser.model == "URG-04LX":
+        scans = scans if logged else even_stamps(scans, delay)
+        scans = scans if every else trusted(scans, ROVER_HIDDEN_BEAMS, ROVER_TRUSTED_MM)
+    write(log, scans, source.name)
+    return scans
