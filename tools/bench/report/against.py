@@ -26,7 +26,7 @@ class CannotCompare(Exception):
     """The run to compare with cannot be; the text says why."""
 
 
-class _KeptFigure(msgspec.Struct):
+class OldFigure(msgspec.Struct):
     """Of a report's file, what is needed here; so are the next two."""
 
     name: str
@@ -34,28 +34,30 @@ class _KeptFigure(msgspec.Struct):
     worse: str = ""
 
 
-class _KeptResult(msgspec.Struct):
+class Old(msgspec.Struct):
+    """What another run says of the same thing."""
+
     name: str
     passed: bool
     seconds: float
     skipped: str = ""
-    figures: list[_KeptFigure] = []
+    measured: list[OldFigure] = msgspec.field(name="figures", default_factory=list)
+
+    @property
+    def outcome(self) -> str:
+        """In a word."""
+        return SKIPPED if self.skipped else "passed" if self.passed else "FAILED"
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Values by name."""
+        return {figure.name: figure.value for figure in self.measured}
 
 
 class _Kept(msgspec.Struct):
-    results: list[_KeptResult]
+    results: list[Old]
     bench: str = ""
     about: dict[str, str] = {}
-
-
-@dataclass(frozen=True, slots=True)
-class Old:
-    """What another run says of the same thing; ``judged``: the figures of which one way was worse."""
-
-    outcome: str
-    seconds: float
-    figures: dict[str, float]
-    judged: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,13 +120,7 @@ def read(against: Path, bench: str) -> Before:
         raise CannotCompare(f"{file} holds no results of a bench: {error}") from error
     if told.bench not in ("", bench):
         raise CannotCompare(f"{file} is a report of {told.bench}, and this is {bench}: name one of {bench}")
-    return Before(file, told.bench, told.about, {one.name: _old(one) for one in told.results})
-
-
-def _old(one: _KeptResult) -> Old:
-    outcome = SKIPPED if one.skipped else "passed" if one.passed else "FAILED"
-    figures = {figure.name: figure.value for figure in one.figures}
-    return Old(outcome, one.seconds, figures, frozenset(figure.name for figure in one.figures if figure.worse))
+    return Before(file, told.bench, told.about, {one.name: one for one in told.results})
 
 
 def compare(results: Sequence[Result], facts: dict[str, str], before: Before | None) -> Compared:
@@ -192,6 +188,8 @@ def _lost(one: Result, old: Old) -> list[str]:
         if figure.name in old.figures and figure.lost(old.figures[figure.name])
     ]
     if one.passed and not one.skipped:  # otherwise it is said above why there are none
-        gone = sorted(old.judged - {figure.name for figure in one.figures})
+        gone = sorted(
+            {figure.name for figure in old.measured if figure.worse} - {figure.name for figure in one.figures}
+        )
         found += [f"{one.name}: {name} is not measured any more, {old.figures[name]:.4g} then" for name in gone]
     return found
