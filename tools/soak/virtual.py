@@ -30,24 +30,11 @@ from estimator.pipeline import new_state, step
 from estimator.result import StepResult
 from hal.clock import SystemClock
 from hal.lidar import LidarStatus, Link
+from tools.bench.support.manual_clock import ManualClock
 from tools.soak.patrol import Patrol
 from tools.soak.watched import Watch
 
 WINDOWS: Final = 96
-
-
-class Hands:
-    """A clock that is put forward by hand."""
-
-    t = 0.0
-
-    def now(self) -> float:
-        """See :class:`hal.clock.Clock`."""
-        return self.t
-
-    def utc(self) -> float:
-        """See :class:`hal.clock.Clock`."""
-        return 1.8e9 + self.t
 
 
 @dataclass(slots=True)
@@ -65,7 +52,7 @@ def run(days: float, building: str, seed: int = 0, say: Callable[[str], None] = 
 
 
 async def _run(seconds: int, patrol: Patrol, say: Callable[[str], None]) -> Days:
-    clock = Hands()
+    clock = ManualClock()
     state = new_state(lights=LightsSetup(patrol.survey, clock_ppm=0.0))
     fresh: list[Record] = []
 
@@ -97,7 +84,7 @@ async def _run(seconds: int, patrol: Patrol, say: Callable[[str], None]) -> Days
     return Days(watch, tracking, float(np.median(errors)))
 
 
-Given = tuple[int, Hands, list[Record], Callable[[], tuple[float, ...]]]
+Given = tuple[int, ManualClock, list[Record], Callable[[], tuple[float, ...]]]
 """Seconds, the clock, records of light that wait, and how much the map holds."""
 
 
