@@ -73,7 +73,7 @@ def test_what_a_robot_tells_its_place_by_is_reported_apart() -> None:
     said = [judged("a-0", track(), ALL, (True, True, facts)) for facts in ("", "{'lit': True}")]
     often = track(15.0, error_m=0.015, error_rad=0.01, sigma_m=0.01)
     seldom = track(5.0, error_m=0.025, error_rad=0.01, sigma_m=0.01)
-    text = Summary(said, [np.vstack([often, seldom]), often]).text()
+    text = "\n".join(Summary(said, [np.vstack([often, seldom]), often]).figures())
     assert "laser only, without wheels: TRACKING in clean drives 100.0% of 1; median error 1.5 cm" in text
     assert "within two sigmas 75.0%, three 100.0%" in text
     assert "lit, without wheels" in text
@@ -177,7 +177,7 @@ def test_a_short_drive_tracks_and_is_kept(tmp_path: Path) -> None:
         )
     assert campaign.missing(["clean_unlit"], range(2), tmp_path) == []
     found = report(tmp_path, ["clean_unlit"])
-    assert "wrong: 0 of 2: at most 77.64% of scenarios like these (95 %)" in found.text()
+    assert "wrong: 0 of 2: at most 77.64% of scenarios like these (95 %)" in "\n".join(found.figures())
     told = campaign.told(found, range(2))
     assert (told.figures[0].value, told.figures[0].ok) == (0.0, True)
     (picture,) = draw_pictures(told, tmp_path)
