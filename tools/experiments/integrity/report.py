@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import beta
 
 from daemon.snapshot import State
 from tools.experiments.integrity.run import COLUMNS
 from tools.experiments.integrity.scene import SETTLED_S
+from tools.experiments.support.proof import proved_share
 from tools.experiments.support.report import Cell
 
 Array = npt.NDArray[np.float64]
@@ -133,11 +133,6 @@ class Summary:
                 f"{np.mean(error <= 3.0 * sigma):.1%}"
             )
         return lines
-
-
-def proved_share(wrong: int, n: int) -> float:
-    """The largest share of which so few of ``n`` would still be seen once in twenty times (Clopper-Pearson)."""
-    return float(beta.ppf(0.95, wrong + 1, n - wrong)) if wrong < n else 1.0
 
 
 def report(out: Path, kinds: Iterable[str]) -> Summary:

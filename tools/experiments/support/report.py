@@ -12,12 +12,14 @@ import json
 import math
 import multiprocessing
 import os
+import pickle
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -28,7 +30,7 @@ Result = TypeVar("Result")
 Cell = str | float | int
 
 COMMAND: Final = "python -m tools.experiments --only"
-ROOT: Final = Path(__file__).parents[2]
+ROOT: Final = Path(__file__).parents[3]
 BAR: Final = 30
 """Characters of a progress bar."""
 
@@ -99,13 +101,20 @@ class Work:
             raise ValueError(f"jobs = {jobs}: at least one process is needed")
         self.jobs, self.progress, self.trials, self._shown_at = jobs, progress, trials, -math.inf
 
-    def map(self, function: Callable[[Item], Result], items: Iterable[Item], label: str = "") -> list[Result]:
+    def map(
+        self, function: Callable[[Item], Result], items: Iterable[Item], label: str = "", keep: Path | None = None
+    ) -> list[Result]:
         """``[function(item) for item in items]``, in that order; both must be importable by other processes.
+
+        ``keep``: a folder in which each result is stored when it is done; a run that was interrupted goes on there.
 
         Raises:
             whatever ``function`` raises.
         """
         trials = list(items)
+        if keep is not None:
+            keep.mkdir(parents=True, exist_ok=True)
+            function = partial(_kept, function, keep)
         if self.jobs == 1 or len(trials) < 2:
             return self._collect(map(function, trials), len(trials), label)
         # spawn: a fork would copy threads' locks; each child imports afresh, with kernels from the cache
@@ -126,6 +135,18 @@ class Work:
             bar = ("#" * (BAR * done // total)).ljust(BAR, ".")
             sys.stderr.write(f"\r  {bar} {done}/{total} {label}\x1b[K" + ("\n" if done == total else ""))
             sys.stderr.flush()
+
+
+def _kept(function: Callable[[Item], Result], folder: Path, item: Item) -> Result:
+    """The result that is stored for an item; else it is made, and stored."""
+    path = folder / f"{re.sub(r'[^A-Za-z0-9.]+', '-', repr(item)).strip('-')}.pickle"
+    if path.exists():
+        result: Result = pickle.loads(path.read_bytes())  # made by this code, under a digest of it
+        return result
+    result = function(item)
+    path.with_suffix(".new").write_bytes(pickle.dumps(result))
+    path.with_suffix(".new").replace(path)
+    return result
 
 
 @cache

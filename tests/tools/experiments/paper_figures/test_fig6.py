@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from estimator.numerics import se2
 from tools.experiments import islands
 from tools.experiments.paper_figures import fig6
 from tools.experiments.paper_figures.fig6_curves import Point, accepted, best, counted, point, right, rule
-from tools.experiments.paper_figures.fig6_trial import LASER, LIT, Detection, Drive, Way, stored
+from tools.experiments.paper_figures.fig6_trial import LASER, LIT, Detection, Drive, Way, trial
 from tools.experiments.paper_figures.fig6_truth import Truth
 from tools.experiments.support.loop_drives import HOME, room_drive, room_route
 from tools.experiments.support.report import Work, save
@@ -97,14 +96,8 @@ def test_precision_and_recall() -> None:
     assert Point(0, 0, 2, 0).precision == 1.0
 
 
-def test_what_is_done_is_kept(tmp_path: Path) -> None:
-    kept = drive(GOOD)
-    (tmp_path / "7-80.pickle").write_bytes(pickle.dumps(kept))
-    assert stored((7, 80.0, tmp_path)).anywhere == [GOOD]
-
-
 def test_the_report_has_its_tables_and_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fig6, "stored", lambda task: drive(GOOD, MIRROR))
+    monkeypatch.setattr(fig6, "trial", lambda task: drive(GOOD, MIRROR))
     report = fig6.run(True, Work())
     save("fig6", report, {}, tmp_path)
     assert (tmp_path / "fig6.json").exists()
@@ -131,7 +124,7 @@ def test_lamps_of_a_case_are_as_the_case_says() -> None:
 
 @pytest.mark.slow
 def test_a_short_drive_closes_right_loops_only() -> None:
-    short = stored((1, 40.0, None))
+    short = trial((1, 40.0))
     for way in short.ways.values():
         assert way.loops
         assert all(right(one) or one.off_m < 0.05 for one in way.loops)

@@ -8,16 +8,16 @@ import pytest
 from daemon.snapshot import State
 from estimator.light_filter.light_channel import LightsSetup
 from tools.experiments.relocation.maps import mapped
-from tools.experiments.relocation.relocate import at_most
 from tools.experiments.relocation.trial import Case, Moment, outcome, trial
 from tools.experiments.relocation.worlds import Carried, Site, Stroll, lit_house, odometry, stroll
+from tools.experiments.support.proof import proved_share
 from tools.sim.ceiling.ceiling import Effects
 
 
 def test_none_of_n_proves_three_by_n() -> None:
-    assert at_most(0, 1000) == pytest.approx(3.0 / 1000, rel=0.01)
-    assert at_most(0, 40) == pytest.approx(0.072, abs=0.001)
-    assert at_most(2, 100) == pytest.approx(0.0616, abs=0.001)
+    assert proved_share(0, 1000) == pytest.approx(3.0 / 1000, rel=0.01)
+    assert proved_share(0, 40) == pytest.approx(0.072, abs=0.001)
+    assert proved_share(2, 100) == pytest.approx(0.0616, abs=0.001)
 
 
 def test_places_are_free_and_codes_of_a_room_that_is_repeated_are_not_unique() -> None:

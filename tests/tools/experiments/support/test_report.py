@@ -194,3 +194,11 @@ def test_every_experiment_is_offered() -> None:
 def test_the_conditions_of_the_paper_are_those_of_the_room() -> None:
     report = table1.run(True, Work())
     assert report.figures[0].ok, report.tables[0].text()
+
+
+def test_results_that_are_stored_are_not_made_again(tmp_path: Path) -> None:
+    made: list[tuple[int, str]] = []
+    items = [(1, "a b"), (2, "c")]
+    for wanted in (items[:1], items):
+        assert Work().map(lambda item: made.append(item) or item[0], wanted, keep=tmp_path) == [k for k, _ in wanted]
+    assert made == items
