@@ -23,8 +23,9 @@ from daemon.snapshot import State
 from tests.rotation import share
 from tools.demo.acts import ROBOT, Act, OrderRefused, Stage, complaint, programme
 from tools.demo.run import free_port, line, links, write_config
-from tools.demo.score import Score, Track, cause, in_map, summary, verdict
+from tools.demo.score import Score, Track, cause, summary, verdict
 from tools.sim.robot.drive import Body
+from tools.sim.robot.truth import in_map
 
 
 def reading(state: State = State.TRACKING, pose: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Any:
@@ -37,8 +38,7 @@ def reading(state: State = State.TRACKING, pose: tuple[float, float, float] | No
 
 def test_truth_is_turned_into_the_map() -> None:
     """The map's origin is where the robot truly stood at (1, 2) facing north; it has driven 3 m north since."""
-    origin = ((0.0, 0.0, 0.0), (1.0, 2.0, math.pi / 2))
-    seen = in_map((1.0, 5.0, math.pi / 2), origin)
+    seen = in_map((1.0, 5.0, math.pi / 2), (1.0, 2.0, math.pi / 2), (0.0, 0.0, 0.0))
     assert seen == pytest.approx((3.0, 0.0, 0.0), abs=1e-12)
 
 

@@ -9,9 +9,10 @@ import pytest
 
 from daemon.snapshot import State
 from hal.replay.carmen import read_carmen
-from tools.sim.harness import Run, in_frame_of, run
+from tools.sim.harness import Run, run
 from tools.sim.hybrid import HybridScene
 from tools.sim.report import describe, write_csv
+from tools.sim.robot.truth import in_map
 from tools.sim.scene import Scenario
 
 
@@ -92,7 +93,7 @@ def test_a_daemon_that_never_gets_a_scan_is_an_error() -> None:
 
 def test_truth_is_seen_from_the_map() -> None:
     truth = np.array([[1.0, 1.0, np.pi / 2], [1.0, 3.0, np.pi / 2]])
-    seen = in_frame_of(truth, truth[0], np.array([0.0, 0.0, 0.0]))
+    seen = in_map(truth, truth[0], np.array([0.0, 0.0, 0.0]))
     np.testing.assert_allclose(seen, [[0, 0, 0], [2, 0, 0]], atol=1e-12)
 
 

@@ -22,6 +22,7 @@ import pytest
 from daemon.health.faults import Fault
 from daemon.publish.modbus import parts_block, registers
 from daemon.snapshot import NO_CONDITION
+from tools.bench.support import children
 from tools.bench.support.other_clock import OtherClock
 from tools.bench.system.modbus import example
 from tools.bench.vm import __main__ as command
@@ -34,6 +35,7 @@ from tools.bench.vm.scenarios import PARTS, SCENARIOS, SHARES, WRITTEN
 from tools.bench.world import agreement
 from tools.bench.world.room import room
 from tools.sim.harness import run
+from tools.sim.robot.truth import in_map
 from tools.sim.scene import SimulatedScene
 
 ROOT = Path(__file__).parents[4]
@@ -105,7 +107,7 @@ def test_a_folder_left_by_a_killed_process_is_removed(tmp_path: Path, monkeypatc
 
 def test_what_the_bench_starts_ends_with_it_however_it_ends() -> None:
     """QEMU and the world, when the bench is killed."""
-    words = [*places.LEASH, "sleep", "60"]
+    words = [*children.LEASH, "sleep", "60"]
     code = f"import subprocess, time; print(subprocess.Popen({words}).pid, flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
@@ -390,7 +392,7 @@ def test_a_line_that_nobody_reads_loses_what_is_sent_and_stops_nobody() -> None:
 
 
 def test_a_pose_is_compared_where_the_map_begins() -> None:
-    x, y, yaw = bench.inverse_then((1.0, 2.0, math.pi / 2), (1.0, 3.0, math.pi))
+    x, y, yaw = in_map((1.0, 3.0, math.pi), (1.0, 2.0, math.pi / 2), (0.0, 0.0, 0.0))
     assert (x, y, yaw) == pytest.approx((1.0, 0.0, math.pi / 2))
 
 
