@@ -99,8 +99,8 @@ bench: $(PEERS)  ## figures as a table and as out/bench/*.json, ratios against p
 bench-vm: venv  ## the package in an emulated Debian with real kernel interfaces (root for the first run; docs/bench.md)
 	$(RUN) -m tools.bench.vm $(ARGS)
 
-fuzz: venv  ## damaged bytes to every parser, a tenth of the full size (ARGS="log --share 1")
-	$(RUN) -m tests.fuzz $(ARGS)
+fuzz: venv  ## damaged bytes to every parser, a tenth of the full size (ARGS="-m slow": all of it; ARGS="-k log")
+	$(BIN)/python -m pytest -q tests/fuzz/test_parsers.py -m "not slow" $(ARGS)
 
 soak: venv  ## a simulated day, or ARGS="--days 30", ARGS="--real 60": does anything grow?
 	$(RUN) -m tools.soak $(ARGS)

@@ -20,7 +20,7 @@ from hypothesis import settings
 from hal.clock import run_virtual
 
 settings.register_profile("shared machine", deadline=None)
-settings.load_profile("shared machine")  # how long an example takes there says nothing; `tests.fuzz` judges stalls
+settings.load_profile("shared machine")  # how long an example takes there says nothing; `tests/fuzz` judges stalls
 
 ROOT = Path(__file__).parents[1]
 UNTRACED = ("estimator", "faults", "fuzz", "hil", "logs", "tools")

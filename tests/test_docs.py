@@ -67,7 +67,7 @@ def programs() -> dict[str, list[tuple[str, list[str]]]]:
     for page in PAGES:
         text = page.read_text().replace("\\\n", "")
         told = re.findall(r"python -m ((?:tools|hal|tests)[\w.]*)([^\n`#]*)", text)
-        for target, words in re.findall(r"make (experiments|bench|demo|soak|fuzz)\b(?: ARGS=(\"[^\"]*\"|\S+))?", text):
+        for target, words in re.findall(r"make (experiments|bench|demo|soak)\b(?: ARGS=(\"[^\"]*\"|\S+))?", text):
             told.append((MADE[target], words.strip('"`')))
         for module, words in told:
             options = re.findall(r"(?<![\w-])--[a-z][a-z-]*", words)
@@ -75,8 +75,7 @@ def programs() -> dict[str, list[tuple[str, list[str]]]]:
     return found
 
 
-MADE = {"experiments": "tools.experiments", "bench": "tools.bench", "demo": "tools.demo.run", "soak": "tools.soak",
-        "fuzz": "tests.fuzz"}  # fmt: skip
+MADE = {"experiments": "tools.experiments", "bench": "tools.bench", "demo": "tools.demo.run", "soak": "tools.soak"}
 
 
 HELP = """

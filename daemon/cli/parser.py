@@ -55,6 +55,7 @@ def parser() -> argparse.ArgumentParser:
     _check(commands.add_parser("check", help="say whether a configuration file, and the survey it names, are good"))
     _probe(commands.add_parser("probe", help="find lidars and photodiode converters and say what they are"))
     _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
+    _convert(commands.add_parser("convert", help="turn recorded lidar data of other formats into a log for replay"))
     _why(commands.add_parser("why", help="replay what was recorded around a moment, and say why it was as it was"))
     _status(commands.add_parser("status", help="show what a running daemon publishes"))
     _explain(commands.add_parser("explain", help="what a key, a state, a fault, a reason or a register means"))
@@ -135,6 +136,15 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--method", choices=METHODS, default=LUMILOOP, help=f"{known}; default: {LUMILOOP}")
     config_arguments(parser)
     parser.set_defaults(body=estimating("daemon.cli.replay", "main"))
+
+
+def _convert(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", type=Path, metavar="IN", help="a .dat (.gz) or .npz file; see docs/data.md")
+    parser.add_argument("log", type=Path, metavar="OUT", help="the log to write, .log or .log.gz")
+    parser.add_argument("--logged", action="store_true", help="keep the host's stamps instead of even ones")
+    parser.add_argument("--delay", type=float, metavar="S", help="from the first beam to mean arrival (default 0.12)")
+    parser.add_argument("--all", action="store_true", help="keep beams that see the rover and ranges beyond 4 m")
+    parser.set_defaults(body=loaded("daemon.cli.convert", "main"))
 
 
 def _why(parser: argparse.ArgumentParser) -> None:

@@ -130,7 +130,7 @@ FOREIGN: Final = {
 }
 MOVED_S: Final = 0.005
 """The passive codec does not know the speed of the line, nor what the driver knew of the sensor's clock."""
-_REMEDY: Final = "unpack it, or turn it into a CARMEN log with `python -m tools.convert IN OUT`"
+_REMEDY: Final = "unpack it, or turn it into a CARMEN log with `lumiloop convert IN OUT`"
 
 
 def sha256_of(source: Source) -> str:

@@ -31,7 +31,7 @@ Array = npt.NDArray[np.float64]
 
 _GIVE_UP_LINES: Final = 1000
 _NO_ODOMETRY: Final = (np.empty(0), np.empty((0, 3)))
-_REMEDY: Final = "name a log with laser lines, or make one with `python -m tools.convert IN OUT`"
+_REMEDY: Final = "name a log with laser lines, or make one with `lumiloop convert IN OUT`"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

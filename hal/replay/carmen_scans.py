@@ -23,7 +23,7 @@ PARAM_MODEL: Final = "lumiloop_laser_model"
 PARAM_DMIN: Final = "lumiloop_laser_dmin"
 PARAM_PERIOD: Final = "lumiloop_laser_period"
 PARAM_BEAM_DT: Final = "lumiloop_laser_beam_dt"
-"""Parameters that `tools.convert` adds to a log: text, metres, seconds, seconds between beams."""
+"""Parameters that `lumiloop convert` adds to a log: text, metres, seconds, seconds between beams."""
 
 PARAM_MAXIMUM: Final = "robot_front_laser_max"
 _PART: Final = 256

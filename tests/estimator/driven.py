@@ -11,7 +11,7 @@ from estimator.measurements import UNLIMITED, Array, Beam, Odometry, Record, Sca
 from estimator.numerics import se2
 from estimator.pipeline import Settings, State, new_state, step
 from estimator.result import StepResult
-from tools.sim.building.buildings import Building
+from tools.sim.building.building import Building
 from tools.sim.scene import Scenario, SimulatedScene, sweep_of
 
 START_S = 10.0

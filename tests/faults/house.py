@@ -35,10 +35,11 @@ from hal.net.inputs import InputPort
 from tools.sim.ceiling.ceiling import Effects
 from tools.sim.ceiling.effects import IDEAL
 from tools.sim.harness import DEVICE, world
-from tools.sim.light.harness import BUS, light_up, lights_of
 from tools.sim.light.scene import Lights
-from tools.sim.odometry import Wheels
-from tools.sim.robot import Body
+from tools.sim.light_harness import BUS, light_up, lights_of
+from tools.sim.robot.drive import Body
+from tools.sim.robot.odometry import Wheels
+from tools.sim.robot.truth import in_map
 from tools.sim.scene import Scenario, SimulatedScene
 
 LIDAR: Final[LidarModel] = replace(UTM_30LX, ares=480, amin=0, amax=360, afrt=180, rpm=600, true_period_s=0.1002)
@@ -230,17 +231,9 @@ class House:
         placed = result is not None and result.placed
         if snapshot.pose is not None and self._anchor is None:
             self._anchor = site, np.array(snapshot.pose)
-        truth = site if placed or self._anchor is None else _seen_from(*self._anchor, site)
+        truth = site if placed or self._anchor is None else in_map(site, *self._anchor)
         x, y, yaw = truth.tolist()
         self.sights.append(Sight(snapshot, (x, y, yaw), self.daemon.heartbeat.faults))
-
-
-def _seen_from(at: np.ndarray, pose: np.ndarray, site: np.ndarray) -> np.ndarray:
-    """A true pose as seen from the map in which the robot, truly ``at``, has ``pose``."""
-    turn = pose[2] - at[2]
-    c, s = math.cos(turn), math.sin(turn)
-    dx, dy = site[0] - at[0], site[1] - at[1]
-    return np.array((pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, site[2] + turn))
 
 
 @cache

@@ -17,9 +17,10 @@ from tests.hil.ends import FAKE, NONE, AdcEnd, LidarEnd, Operator, operator_for,
 from tests.hil.presence import Presence
 from tests.hil.programs import Served, demand_lumiloop, program, served_lidar
 from tests.hil.walking import Walked, walk_real, walk_simulated
-from tools.bench.against import Before, CannotCompare, read
-from tools.bench.plots import Plot
-from tools.bench.report import About, CannotReport, Figure, Result, demand_apart, facts, write
+from tools.bench.report.against import Before, CannotCompare, read
+from tools.bench.report.page import CannotReport, demand_apart, facts, write
+from tools.bench.report.plots import Plot
+from tools.bench.report.result import About, Figure, Result
 
 NAME = "hil"
 DEVICES = ("lidar", "adc")
@@ -46,7 +47,7 @@ class Telling:
         self.lines.append(text)
 
     def figure(self, name: str, value: float, unit: str = "", **how: Any) -> None:
-        """A number; ``how``: see :class:`tools.bench.report.Figure`."""
+        """A number; ``how``: see :class:`tools.bench.report.result.Figure`."""
         self.figures.append(Figure(name, float(value), unit, **how))
 
     def plot(self, plot: Plot) -> None:

@@ -21,7 +21,7 @@ from typing import Any, Final
 import pytest
 
 from tests.hil.ends import Operator, SocketOperator
-from tools.bench.vm.places import LEASH
+from tools.bench.support.children import LEASH
 from tools.clients.read_modbus import Reader
 
 ROOT: Final = Path(__file__).parents[2]

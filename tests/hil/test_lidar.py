@@ -12,7 +12,7 @@ from hal.hokuyo.models import UNKNOWN_MODEL, facts_of
 from hal.lidar import VALID, Link, RawScan
 from tests.hil.conftest import Telling
 from tests.hil.ends import LidarEnd, asked, ended
-from tools.bench.plots import Plot, Series, histogram
+from tools.bench.report.plots import Plot, Series, histogram
 
 RATE_SHARE = 0.02
 """Motors are held to their nominal speed to a per cent or better (data sheets of URG, UTM, UST)."""

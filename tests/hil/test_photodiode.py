@@ -12,7 +12,7 @@ from hal.adc import Blemish, ChipMissing, RawSamples
 from hal.photodiode.probe import probe_bus
 from tests.hil.conftest import Telling
 from tests.hil.ends import AdcEnd, asked, ended
-from tools.bench.plots import Plot, Series, histogram
+from tools.bench.report.plots import Plot, Series, histogram
 
 DARK_WORDS = 3.0
 """One sigma of amplifier and converter in the dark: 0.45 words of the reference receiver, with room for another one."""

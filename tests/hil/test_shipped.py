@@ -12,7 +12,7 @@ import pytest
 from tests.hil.conftest import Telling
 from tests.hil.programs import ROOT, Daemon, Served, daemon, probed
 from tests.hil.walking import Walked
-from tools.bench.plots import Plot, Series, histogram
+from tools.bench.report.plots import Plot, Series, histogram
 
 MILLI = 1e3
 STILL_M = 0.02

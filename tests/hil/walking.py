@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from tests.hil.ends import Operator
 from tests.hil.programs import Served, daemon, free_port, process
-from tools.sim.robot import Body
+from tools.sim.robot.drive import Body
 
 SIMULATED_S: Final = 30.0
 

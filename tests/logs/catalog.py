@@ -6,12 +6,12 @@ import hashlib
 from pathlib import Path
 
 from daemon.config.schema import Config
+from daemon.replay import convert
 from daemon.replay.log_replay import Outcome, replay
 from daemon.replay.trajectories import Ledger
 from tests.daemon.replay.room import carmen, drive
 from tests.logs import made
 from tests.logs.entries import Entry
-from tools import convert
 
 
 class OtherLog(AssertionError):
@@ -38,7 +38,7 @@ def prepared(entry: Entry, root: Path | None, folder: Path) -> Path:
         raise OtherLog(f"{source} is another log than the one that was blessed: its SHA-256 is {digest}")
     if source.suffix == ".npz" or ".dat" in source.name:
         log = folder / f"{entry.name}.log"
-        assert convert.main([str(source), str(log)]) == 0
+        convert.convert(source, log)
         return log
     return source
 

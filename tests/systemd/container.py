@@ -17,8 +17,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from tools.bench.support.children import LEASH
 from tools.bench.vm.image import APART
-from tools.bench.vm.places import LEASH, workspace
+from tools.bench.vm.places import workspace
 
 SUITE = "bookworm"
 PACKAGES = "systemd,systemd-sysv,dbus,python3,udev"

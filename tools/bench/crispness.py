@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 
 from daemon.config.schema import Config
 from daemon.devices.conversion import ScanBridge
+from daemon.replay import convert
 from daemon.replay.log_replay import Outcome, replay
 from daemon.replay.sources import open_log
 from estimator.measurements import Array, Scan
@@ -33,7 +34,6 @@ from estimator.paper import LUMILOOP
 from estimator.scan_matching.deskew import points_of
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
-from tools import convert
 from tools.bench.support.peers import MANY, NEIGHBOURS, Match, kdtree
 from tools.ci.figures import Figure, bounded
 
@@ -98,8 +98,7 @@ def load(source: Path, method: str = LUMILOOP) -> Drive:
     """Convert a log, replay it by a method, and keep what both ways need."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "scans.log"
-        if convert.main([str(source), str(log)]) != 0:
-            raise RuntimeError(f"{source} could not be converted")
+        convert.convert(source, log)
         outcome = replay(log, Config(), method=method)
         return drive_of(outcome, log)
 

@@ -42,6 +42,7 @@ from hal.clock import Clock
 from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
 from hal.port.port import PortOpener
 from tools.bench.support.drive import EndlessDrive
+from tools.bench.support.manual_clock import ManualClock
 from tools.bench.support.stages import CPU, WALL, Array, Stages, quantiles
 from tools.ci.figures import Figure, bounded, save, table
 
@@ -51,21 +52,6 @@ STAGES: Final = ("bridge", "decode", "search", "lights", "match", "fuse", "map",
 SETTLE_S: Final = 10.0
 """Until all lamps are followed and the map is laid; not counted."""
 MEDIAN_MS, WORST_MS = 2.0, 6.0
-
-
-class Hands:
-    """A clock that is put forward by hand."""
-
-    def __init__(self) -> None:
-        self.t = 0.0
-
-    def now(self) -> float:
-        """See :class:`hal.clock.Clock`."""
-        return self.t
-
-    def utc(self) -> float:
-        """See :class:`hal.clock.Clock`."""
-        return 1.8e9 + self.t
 
 
 class Device:
@@ -128,7 +114,7 @@ def make_daemon(drive: EndlessDrive, clock: Clock, receiver: str, modbus: int) -
 
 async def measure(seconds: float, settle_s: float) -> Outcome:
     """Drive for so long, and time every cycle after the first ``settle_s``."""
-    drive, clock = EndlessDrive(), Hands()
+    drive, clock = EndlessDrive(), ManualClock()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink, socket.socket() as free:
         sink.bind(("127.0.0.1", 0))
         sink.setblocking(False)
@@ -147,7 +133,7 @@ async def measure(seconds: float, settle_s: float) -> Outcome:
             daemon.cycle.parts.worker.close()
 
 
-async def _run(daemon: Daemon, drive: EndlessDrive, clock: Hands, span: tuple[float, float]) -> Outcome:
+async def _run(daemon: Daemon, drive: EndlessDrive, clock: ManualClock, span: tuple[float, float]) -> Outcome:
     cycle, (seconds, settle_s) = daemon.cycle, span
     rate = 1.0 / drive.geometry.period_s
     warm, count = round(settle_s * rate), round(seconds * rate)

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from daemon.config.schema import Config
+from daemon.replay import convert
 from daemon.replay.log_replay import Outcome, replay
-from tools import convert
 from tools.ci.figures import Figure, bounded
 from tools.relations import SPLIT_S, Errors, evaluate, read_relations
 

@@ -57,7 +57,7 @@ PAGE_PORT: Final = 8090
 """Where the web page is, if nobody else is there. After `PAGE_S` the robot drives off without it."""
 PAGE_S: Final = 5.0
 LIDAR_X: Final = 0.15
-"""Where the simulated robot carries its lidar (:class:`tools.sim.robot.Body`), told to the daemon as `lidar.mount`."""
+"""Position of the lidar on the simulated robot (:class:`tools.sim.robot.drive.Body`), configured as `lidar.mount`."""
 
 
 class DemoError(Exception):

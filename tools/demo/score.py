@@ -15,6 +15,7 @@ from daemon.health.reasons import REASONS, Reason
 from daemon.publish.modbus.client import Reading
 from daemon.snapshot import State
 from tools.demo.acts import Act
+from tools.sim.robot.truth import Pose, at_time, in_map
 
 ABSURD_M: Final = 0.5
 """Median position error beyond which the demo has failed."""
@@ -23,8 +24,6 @@ SLOW_SHARE: Final = 0.1
 GOOD: Final = (State.MAPPING, State.TRACKING)
 READY: Final = (*GOOD, State.DEGRADED, State.RELOCATING)
 """States in which the daemon follows a sensor."""
-
-Pose = tuple[float, float, float]
 
 
 @dataclass(slots=True)
@@ -43,13 +42,7 @@ class Track:
 
     def at(self, t_mono: float) -> Pose | None:
         """The true pose at an instant, interpolated; None where it is not covered."""
-        after = next((k for k, (t, _) in enumerate(self.poses) if t >= t_mono), 0)
-        if after == 0:
-            return None
-        (t0, a), (t1, b) = self.poses[after - 1], self.poses[after]
-        part = (t_mono - t0) / (t1 - t0)
-        turn = math.remainder(b[2] - a[2], math.tau)
-        return a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn
+        return at_time(self.poses, t_mono)
 
 
 @dataclass(slots=True)
@@ -92,7 +85,7 @@ class Score:
             self.origin = truth, truth
         if self.origin is None:
             self.origin = pose, truth
-        want = in_map(truth, self.origin)
+        want = in_map(truth, self.origin[1], self.origin[0])
         self.error_m.append(math.hypot(pose[0] - want[0], pose[1] - want[1]))
         self.error_rad.append(math.remainder(pose[2] - want[2], math.tau))
         if state == State.TRACKING.name:
@@ -114,15 +107,6 @@ def pose_of(reading: Reading) -> Pose | None:
     """The published map pose, if there is one."""
     x, y, yaw = (reading[f"map_{axis}"] for axis in ("x", "y", "yaw"))
     return None if x is None or y is None or yaw is None else (float(x), float(y), float(yaw))
-
-
-def in_map(truth: Pose, origin: tuple[Pose, Pose]) -> Pose:
-    """A true pose as seen from the map, which is fixed by one published pose and the truth of its instant."""
-    (x, y, yaw), (x0, y0, yaw0) = origin
-    turn = yaw - yaw0
-    c, s = math.cos(turn), math.sin(turn)
-    dx, dy = truth[0] - x0, truth[1] - y0
-    return x + c * dx - s * dy, y + s * dx + c * dy, truth[2] + turn
 
 
 def summary(score: Score) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from typing import Any, Final
 import tools.experiments
 from tools.ci.figures import table
 from tools.experiments import pages
-from tools.experiments.report import COMMAND, Report, Skipped, Work, code, save
+from tools.experiments.support.report import COMMAND, Report, Skipped, Work, code, save
 
 EXPERIMENTS: Final = {
     "table1": "Table 1", "fig4": "Fig. 4", "fig5": "Fig. 5", "fig5_loops": "Fig. 5, loops closed", "fig6": "Fig. 6",

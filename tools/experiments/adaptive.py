@@ -16,8 +16,8 @@ import numpy as np
 
 from estimator.paper.lateration import Doubt, Prior, Solver, SolverSettings
 from tools.ci.figures import Figure
-from tools.experiments.places import CENTRED, Array, error, sheet_of, spots
-from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
+from tools.experiments.support.places import CENTRED, Array, error, sheet_of, spots
+from tools.experiments.support.report import COMMAND, Cell, Picture, Report, Table, Work
 from tools.sim.building.buildings import building
 from tools.sim.ceiling.ceiling import Ceiling, Effects
 from tools.sim.ceiling.lamps import fixtures

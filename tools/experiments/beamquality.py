@@ -23,7 +23,7 @@ from tools.bench.match import map_of
 from tools.bench.support.scenes import Array, Scene, bearings, office, paper_room
 from tools.bench.support.trials import scan_at, view_of
 from tools.ci.figures import Figure
-from tools.experiments.report import COMMAND, Picture, Report, Table, Work
+from tools.experiments.support.report import COMMAND, Picture, Report, Table, Work
 
 SIGMA: Final = 0.01
 SEED: Final = 12

@@ -24,13 +24,13 @@ from estimator.pipeline import State, new_state
 from estimator.result import StepResult
 from tools.ci.figures import Figure, bounded
 from tools.experiments.corridor_bound import Sizes, bound, seen
-from tools.experiments.loop_drives import BODY, half, play, scans
-from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
+from tools.experiments.support.loop_drives import BODY, half, play, scans
+from tools.experiments.support.report import COMMAND, Cell, Picture, Report, Table, Work
 from tools.sim.building.buildings import building
 from tools.sim.building.world import Array
 from tools.sim.ceiling.movers import lean_of
 from tools.sim.light.link_drive import LightRun, tour_run
-from tools.sim.robot import Drive, Route
+from tools.sim.robot.drive import Drive, Route
 
 SEEDS: Final = (1, 2, 3)
 FROM_S: Final = 10.0

@@ -17,18 +17,18 @@ from estimator.light_filter.survey import Survey
 from estimator.numerics import se2
 from estimator.pipeline import Settings, keyframe_poses, new_state
 from tools.ci.figures import bounded
-from tools.experiments.loop_drives import play, scans
 from tools.experiments.paper_figures.fig6_curves import right
 from tools.experiments.paper_figures.fig6_trial import Watcher
-from tools.experiments.report import COMMAND, Picture, Report, Table, Work
+from tools.experiments.support.loop_drives import play, scans
+from tools.experiments.support.report import COMMAND, Picture, Report, Table, Work
 from tools.sim.building.buildings import building
 from tools.sim.building.doors import Kind, doors
 from tools.sim.building.world import Array
 from tools.sim.ceiling.ceiling import ceiling_of
 from tools.sim.ceiling.links import Reception
 from tools.sim.light.link_drive import LightRun
-from tools.sim.odometry import Wheels
-from tools.sim.robot import Body, Drive
+from tools.sim.robot.drive import Body, Drive
+from tools.sim.robot.odometry import Wheels
 
 CASES: Final = {
     "one door in 4 open, 2.6 m wide": Kind(2.6, 4),

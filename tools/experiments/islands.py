@@ -22,12 +22,12 @@ from estimator.measurements import Job, Record, Scan
 from estimator.pipeline import Settings, State, keyframe_poses, new_state
 from estimator.result import StepResult
 from tools.ci.figures import Figure, bounded
-from tools.experiments.loop_drives import BODY, RATE_HZ, half, scans
 from tools.experiments.paper_figures.fig6_curves import Point, counted
 from tools.experiments.paper_figures.fig6_trial import FROM_S, Watcher
 from tools.experiments.relocation.trial import Moment, Robot, Said, longest
-from tools.experiments.report import COMMAND, Report, Table, Work
-from tools.experiments.trajectory import Errors, Track, errors, started
+from tools.experiments.support.loop_drives import BODY, RATE_HZ, half, scans
+from tools.experiments.support.report import COMMAND, Report, Table, Work
+from tools.experiments.support.trajectory import Errors, Track, errors, started
 from tools.sim.building.buildings import building
 from tools.sim.building.world import Array
 from tools.sim.ceiling.ceiling import Ceiling, Effects
@@ -36,8 +36,8 @@ from tools.sim.ceiling.links import Reception
 from tools.sim.ceiling.movers import lean_of
 from tools.sim.ceiling.records import survey
 from tools.sim.light.link_drive import LightRun
-from tools.sim.odometry import Wheels
-from tools.sim.robot import Drive
+from tools.sim.robot.drive import Drive
+from tools.sim.robot.odometry import Wheels
 
 SEEDS: Final = (1, 2, 3)
 LAPS: Final = 2

@@ -24,10 +24,10 @@ from estimator.light_filter.residual_lookup import ResidualCorrections
 from estimator.measurements import LightEpoch, Odometry
 from estimator.result import Fix
 from tools.ci.figures import Figure, bounded
-from tools.experiments.report import COMMAND, Picture, Report, Table, Work
+from tools.experiments.support.report import COMMAND, Picture, Report, Table, Work
 from tools.sim.ceiling.ceiling import Effects
 from tools.sim.light.link_drive import ROOM_BODY, LightRun, room_run
-from tools.sim.robot import Drive, Route
+from tools.sim.robot.drive import Drive, Route
 
 Array = npt.NDArray[np.float64]
 

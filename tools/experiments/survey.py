@@ -16,7 +16,7 @@ from estimator.calibration.lamp_mapping import Heard, Surveyed
 from estimator.calibration.lamp_mapping import survey as survey_by_drive
 from estimator.calibration.observations import Rows
 from tools.ci.figures import bounded
-from tools.experiments.report import COMMAND, Picture, Report, Table, Work
+from tools.experiments.support.report import COMMAND, Picture, Report, Table, Work
 from tools.sim.light.link_drive import LightRun, room_run
 
 Array = npt.NDArray[np.float64]

@@ -33,9 +33,10 @@ from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inputs import InputPort
 from tools.sim.building.world import Array
 from tools.sim.feed import feed_odometry
-from tools.sim.hands import Hands
-from tools.sim.light.harness import BUS, LEVEL, LinkBridge, light_up, lights_of
 from tools.sim.light.scene import LINK
+from tools.sim.light_harness import BUS, LEVEL, LinkBridge, light_up, lights_of
+from tools.sim.robot.hands import Hands
+from tools.sim.robot.truth import in_map
 from tools.sim.scene import Scenario, Scene, SimulatedScene
 
 DEVICE: Final = "/dev/simulated"
@@ -99,7 +100,7 @@ def run(
         scenario: the simulated scene; default the paper's robot in the paper's room.
         scene: another scene, instead of a scenario.
         faults: TOML schedule of faults of the lidar and, with lights, of the converter (``adc``), and of being carried
-            (``robot``, see tools/sim/hands.py).
+            (``robot``, see tools/sim/robot/hands.py).
         odometry: whether wheel odometry is fed.
         lidar: whether there is a lidar; without one, lights must be in the scenario.
         record: folder for a recording of the run; light has to come as words of the converter.
@@ -224,7 +225,7 @@ def _collect(log: _Log, scene: Scene, scans_sent: int) -> Run:
     pose = _poses(snapshots, "pose")
     first = snapshots.index(posed[0])
     placed, site = np.array(log.placed), scene.truth(t)
-    truth = np.where(placed[:, None], site, in_frame_of(site, site[first], pose[first]))
+    truth = np.where(placed[:, None], site, in_map(site, site[first], pose[first]))
     return Run(
         t_mono=t,
         pose=pose,
@@ -243,11 +244,3 @@ def _collect(log: _Log, scene: Scene, scans_sent: int) -> Run:
 
 def _poses(snapshots: list[Snapshot], name: str) -> Array:
     return np.array([getattr(snapshot, name) or [np.nan] * 3 for snapshot in snapshots])
-
-
-def in_frame_of(truth: Array, at: Array, pose: Array) -> Array:
-    """True poses (n, 3) as seen from the map in which the robot, truly ``at``, has ``pose``."""
-    turn = pose[2] - at[2]
-    c, s = np.cos(turn), np.sin(turn)
-    dx, dy = truth[:, 0] - at[0], truth[:, 1] - at[1]
-    return np.column_stack([pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, truth[:, 2] + turn])

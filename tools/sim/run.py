@@ -39,10 +39,10 @@ from hal.run_server import run_until_stopped
 from tools.sim.building.buildings import BUILDINGS
 from tools.sim.ceiling.ceiling import Effects
 from tools.sim.feed import TumWriter, UdpSender, feed_odometry, feed_truth
-from tools.sim.hands import Hands
 from tools.sim.hybrid import HybridScene
 from tools.sim.light.scene import Lights
 from tools.sim.light.serve import serve_light, write_plan
+from tools.sim.robot.hands import Hands
 from tools.sim.scene import Scenario, Scene, SimulatedScene
 
 LOG_LEAD_S = 3.0

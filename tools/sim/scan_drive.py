@@ -17,7 +17,8 @@ from tools.sim.building.beams import UTM_30LX, Posture, Scanner
 from tools.sim.building.people import Crowd, Walker
 from tools.sim.building.world import Array
 from tools.sim.light.link_drive import LightRun
-from tools.sim.scene import OPTICS, compose, lidar_model, sweep_of
+from tools.sim.robot.drive import compose
+from tools.sim.scene import OPTICS, lidar_model, sweep_of
 
 SIGMA_M: Final = 0.01
 """Range noise that the data sheet of this kind of lidar promises."""

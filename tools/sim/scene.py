@@ -16,13 +16,14 @@ from hal.fake.lidar.rotor import Rotor
 from hal.fake.lidar.scan import FakeScan
 from tools.sim.building import beams
 from tools.sim.building.beams import Optics, Posture, Returns, Scanner, Sweep
-from tools.sim.building.buildings import Building, building
+from tools.sim.building.building import Building
+from tools.sim.building.buildings import building
 from tools.sim.building.people import Crowd
 from tools.sim.building.world import Array
-from tools.sim.hands import Way, start_of, then
 from tools.sim.light.scene import Lights, SceneLight
-from tools.sim.odometry import Odometer, Wheels
-from tools.sim.robot import Body, Drive
+from tools.sim.robot.drive import Body, Drive, compose
+from tools.sim.robot.hands import Way, start_of, then
+from tools.sim.robot.odometry import Odometer, Wheels
 
 OPTICS: Final[dict[str, Optics]] = {
     "URG-04LX": beams.URG_04LX, "URG-04LX-UG01": beams.URG_04LX, "UBG-04LX-F01": beams.URG_04LX,
@@ -206,13 +207,6 @@ def lidar_model(name: str | LidarModel) -> LidarModel:
     if name not in MODELS:
         raise ValueError(f"no lidar is called {name!r}; there are: {', '.join(MODELS)}")
     return MODELS[name]
-
-
-def compose(poses: Array, offset: tuple[float, float, float]) -> Array:
-    """(n, 3) poses, each followed by the same planar transform."""
-    x, y, yaw = offset
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    return np.column_stack([poses[:, 0] + c * x - s * y, poses[:, 1] + s * x + c * y, poses[:, 2] + yaw])
 
 
 def sweep_of(model: LidarModel) -> Sweep:

@@ -22,9 +22,8 @@ from tools.sim.ceiling.ceiling import Array, Effects, ceiling_of
 from tools.sim.ceiling.links import EPOCH_S, Links
 from tools.sim.ceiling.movers import lean_of, walkers_of
 from tools.sim.ceiling.records import frames, light_epoch, survey
-from tools.sim.odometry import Odometer, Wheels
-from tools.sim.robot import Body, Drive
-from tools.sim.scene import compose
+from tools.sim.robot.drive import Body, Drive, compose
+from tools.sim.robot.odometry import Odometer, Wheels
 
 BEAMS: Final = 90
 STEP_RAD: Final = np.radians(3.0)

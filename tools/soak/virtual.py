@@ -30,44 +30,29 @@ from estimator.pipeline import new_state, step
 from estimator.result import StepResult
 from hal.clock import SystemClock
 from hal.lidar import LidarStatus, Link
+from tools.bench.support.manual_clock import ManualClock
 from tools.soak.patrol import Patrol
 from tools.soak.watched import Watch
 
-BUILDING: Final = "paper_room"
 WINDOWS: Final = 96
-
-
-class Hands:
-    """A clock that is put forward by hand."""
-
-    t = 0.0
-
-    def now(self) -> float:
-        """See :class:`hal.clock.Clock`."""
-        return self.t
-
-    def utc(self) -> float:
-        """See :class:`hal.clock.Clock`."""
-        return 1.8e9 + self.t
 
 
 @dataclass(slots=True)
 class Days:
-    """What came of it: rows, share of cycles in TRACKING, median error in m; keyframes, submaps and loops kept."""
+    """What came of it: rows, share of cycles in TRACKING, median error in m."""
 
     watch: Watch
     tracking: float
     error_m: float
-    kept: tuple[int, int, int]
 
 
-def run(days: float, seed: int = 0, say: Callable[[str], None] = lambda text: None) -> Days:
-    """Drive for so many days."""
-    return asyncio.run(_run(round(86400.0 * days), seed, say))
+def run(days: float, building: str, seed: int = 0, say: Callable[[str], None] = lambda text: None) -> Days:
+    """Drive through a building for so many days."""
+    return asyncio.run(_run(round(86400.0 * days), Patrol(building, seed), say))
 
 
-async def _run(seconds: int, seed: int, say: Callable[[str], None]) -> Days:
-    patrol, clock = Patrol(BUILDING, seed), Hands()
+async def _run(seconds: int, patrol: Patrol, say: Callable[[str], None]) -> Days:
+    clock = ManualClock()
     state = new_state(lights=LightsSetup(patrol.survey, clock_ppm=0.0))
     fresh: list[Record] = []
 
@@ -75,6 +60,10 @@ async def _run(seconds: int, seed: int, say: Callable[[str], None]) -> Days:
         made = step(state, (*fresh, *records), limits)
         fresh.clear()
         return made
+
+    def kept() -> tuple[float, ...]:
+        graph = state.map.graph
+        return float(len(state.map.keyframes)), float(len(graph.submaps)), float(len(graph.constraints.loop))
 
     x, y, yaw = patrol.mount
     scans = ScanBridge(LidarConfig(mount=Mount(float(x), float(y), float(np.degrees(yaw)))))
@@ -88,18 +77,21 @@ async def _run(seconds: int, seed: int, say: Callable[[str], None]) -> Days:
         await sender.start()
         cycle.parts.sinks += [modbus.publish, sender.publish]
         try:
-            watch, tracking, errors = await _drive(cycle, patrol, (seconds, clock, fresh), say)
+            watch, tracking, errors = await _drive(cycle, patrol, (seconds, clock, fresh, kept), say)
         finally:
             await sender.close()
             await modbus.close()
-    kept = len(state.map.keyframes), len(state.map.graph.submaps), len(state.map.graph.constraints.loop)
-    return Days(watch, tracking, float(np.median(errors)), kept)
+    return Days(watch, tracking, float(np.median(errors)))
+
+
+Given = tuple[int, ManualClock, list[Record], Callable[[], tuple[float, ...]]]
+"""Seconds, the clock, records of light that wait, and how much the map holds."""
 
 
 async def _drive(
-    cycle: Cycle, patrol: Patrol, given: tuple[int, Hands, list[Record]], say: Callable[[str], None]
+    cycle: Cycle, patrol: Patrol, given: Given, say: Callable[[str], None]
 ) -> tuple[Watch, float, list[float]]:
-    seconds, clock, fresh = given
+    seconds, clock, fresh, kept = given
     watch, took, errors, tracking = Watch(), [], [], 0
     window = max(seconds // WINDOWS, 1)
     for number in range(1, seconds + 1):
@@ -120,7 +112,7 @@ async def _drive(
         if number % window == 0:
             gc.collect()
             times = float(np.median(took)), float(np.percentile(took, 99)), max(took)
-            watch.take(number / 3600.0, os.getpid(), times)
+            watch.take(number / 3600.0, os.getpid(), times, kept())
             took.clear()
             say(watch.line())
     return watch, tracking / seconds, errors

@@ -15,6 +15,7 @@ from tools.ci.figures import Figure, bounded
 Array = npt.NDArray[np.float64]
 
 ROWS: Final = ("hours", "resident_mb", "files", "threads", "median_ms", "p99_ms", "worst_ms")
+KEPT: Final = ("keyframes", "submaps", "loops")
 SLOPE_MB_H: Final = 0.5
 SETTLED: Final = 1.0 / 3.0
 """Share of a run that does not count: start, first laps, caches. Twenty minutes of an hour."""
@@ -22,13 +23,15 @@ SETTLED: Final = 1.0 / 3.0
 
 @dataclass(slots=True)
 class Watch:
-    """Rows of :data:`ROWS`; the times are those since the row before."""
+    """Rows of :data:`ROWS`, the times since the row before; ``kept``: of each, :data:`KEPT` of the map, if known."""
 
     rows: list[tuple[float, ...]] = field(default_factory=list)
+    kept: list[tuple[float, ...]] = field(default_factory=list)
 
-    def take(self, hours: float, pid: int, times_ms: tuple[float, float, float]) -> None:
-        """One row, about a process."""
+    def take(self, hours: float, pid: int, times_ms: tuple[float, float, float], kept: tuple[float, ...] = ()) -> None:
+        """One row, about a process, and what its map holds where that is known."""
         self.rows.append((hours, *process(pid), *times_ms))
+        self.kept.append(kept)
 
     def column(self, name: str) -> Array:
         """One of :data:`ROWS`."""
@@ -36,7 +39,8 @@ class Watch:
 
     def line(self) -> str:
         """The latest row for people."""
-        return "  ".join(f"{name} {value:.4g}" for name, value in zip(ROWS, self.rows[-1], strict=True))
+        named = [*zip(ROWS, self.rows[-1], strict=True), *zip(KEPT, self.kept[-1], strict=False)]
+        return "  ".join(f"{name} {value:.4g}" for name, value in named)
 
     def figures(self, command: str) -> list[Figure]:
         """Slopes by least squares, and the least and most of what must not change, after the run has settled."""
@@ -52,6 +56,11 @@ class Watch:
             Figure(f"cycle, {name} of the last row", float(self.column(f"{name}_ms")[-1]), "ms", command=command)
             for name in ("median", "p99", "worst")
         ]
+        kept = np.array(self.kept)
+        for name, column in zip(KEPT, kept.T if kept.size else (), strict=False):
+            rows.append(Figure(f"{name} at the end", float(column[-1]), "", command=command))
+            grown = float(np.polyfit(hours[after], column[after], 1)[0])
+            rows.append(Figure(f"{name}, slope", grown, "1/h", command=command))
         return rows
 
     def draw(self, path: Path) -> None:

@@ -12,7 +12,7 @@ from daemon.config.loader import load
 from daemon.config.survey_loader import read_survey
 from daemon.system import console
 from tests.daemon.commissioning.recorded_drive import record
-from tools.sim.light.harness import BUS
+from tools.sim.light_harness import BUS
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ import pytest
 
 from daemon.app import Daemon, Environment
 from daemon.config.schema import Config, LidarConfig, Mask, ModbusConfig, Mount
+from daemon.replay import convert
 from daemon.replay.log_replay import replay
 from daemon.replay.recorded_inputs import Given
 from daemon.runtime.budget import FixedBudget
@@ -35,7 +36,6 @@ from hal.lidar import VALID, RawScan
 from hal.odometry import RawOdometry
 from hal.port.opening import open_port
 from hal.port.port import PortOpener
-from tools import convert
 
 Array = npt.NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from hal.hokuyo import ticks
 from tools.bench.world.room import LIDAR, room
 from tools.sim import harness
 from tools.sim.harness import Run, run
-from tools.sim.odometry import Wheels
-from tools.sim.robot import Body
+from tools.sim.robot.drive import Body
+from tools.sim.robot.odometry import Wheels
 from tools.sim.scene import Scenario, SimulatedScene
 
 MODULUS_MS: Final = 1 << 24

@@ -23,8 +23,8 @@ from tools.sim.ceiling.ceiling import ceiling_of
 from tools.sim.ceiling.links import Reception
 from tools.sim.ceiling.records import epochs, survey
 from tools.sim.light.link_drive import LightRun, room_run
-from tools.sim.odometry import Wheels
-from tools.sim.robot import Body, Drive, Route
+from tools.sim.robot.drive import Body, Drive, Route
+from tools.sim.robot.odometry import Wheels
 
 pytestmark = [pytest.mark.jit, pytest.mark.no_cover]
 

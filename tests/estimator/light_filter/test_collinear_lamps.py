@@ -18,7 +18,7 @@ from estimator.result import Fix
 from tools.experiments.corridor import CASES, drive_of
 from tools.experiments.islands import CASES as ISLANDS
 from tools.experiments.islands import trial
-from tools.experiments.loop_drives import half, room_drive
+from tools.experiments.support.loop_drives import half, room_drive
 
 pytestmark = pytest.mark.no_cover
 

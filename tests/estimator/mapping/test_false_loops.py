@@ -14,7 +14,7 @@ from estimator.measurements import Array
 from estimator.numerics import se2
 from tools.bench.posegraph import dense, doubting, read_g2o, with_false_loops
 from tools.sim.building.buildings import building
-from tools.sim.robot import Body, Drive
+from tools.sim.robot.drive import Body, Drive
 
 WAY, LOOP = np.array((0.02, 0.02, 0.006)), np.array((0.025, 0.025, 0.008))
 

@@ -19,12 +19,6 @@ from hal.photodiode.sampler import Sampler
 from tests.fuzz.targets import refused
 
 MEGABYTES = 10
-PARSERS = (
-    "hal/photodiode/block_check.py",
-    "hal/photodiode/sampler.py",
-    "hal/photodiode/diagnosis.py",
-    "hal/bus/i2c_frames.py",
-)
 
 LENGTH, SCL = 2222, 400e3
 SPAN = (10 + 9 * LENGTH) / SCL + 60e-6

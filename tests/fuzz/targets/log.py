@@ -15,11 +15,6 @@ from hal.replay.recording import MARKER, Kind, pack_frame, pack_head, pack_imu, 
 from tests.fuzz.targets import a_file, refused, scip
 
 MEGABYTES = 3
-PARSERS = (
-    "hal/replay/carmen.py", "hal/replay/carmen_lines.py", "hal/replay/carmen_scans.py", "hal/replay/text.py",
-    "hal/replay/capture.py", "hal/replay/recording.py", "hal/replay/mount.py", "hal/replay/monotone_stamps.py",
-    "daemon/replay/sources.py",
-)  # fmt: skip
 EVENTS = 20_000
 
 

@@ -14,12 +14,6 @@ from tests.daemon.support.map_maker import Shape, content
 from tests.fuzz.targets import refused
 
 MEGABYTES = 3
-PARSERS = (
-    "daemon/maps/container.py",
-    "daemon/maps/schema.py",
-    "daemon/maps/image.py",
-    "estimator/mapping/map_snapshot.py",
-)
 
 
 def seeds() -> list[bytes]:

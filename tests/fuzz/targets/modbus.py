@@ -16,11 +16,6 @@ from tests.daemon.publish.network import plugged
 from tests.fuzz.test_modbus import check_answer, framed, responder, whole_frames
 
 MEGABYTES = 10
-PARSERS = (
-    "daemon/publish/modbus/requests.py",
-    "daemon/publish/modbus/holding.py",
-    "daemon/publish/modbus/rtu_frames.py",
-)
 
 READ = framed(1, 1, b"\x04\0\0\0\x40")
 

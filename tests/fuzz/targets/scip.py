@@ -12,7 +12,6 @@ from hal.hokuyo.scip import BadFrame, FrameSplitter, parse_reply, parse_stamp, p
 from tests.hal.hokuyo import encoder
 
 MEGABYTES = 50
-PARSERS = ("hal/hokuyo/scip.py", "hal/hokuyo/payload.py", "hal/hokuyo/passive.py", "hal/hokuyo/models.py")
 
 GREETING = encoder.text("VV", encoder.VV_UTM) + encoder.text("PP", encoder.PP_UTM)
 GOOD = ScanRequest("MD", 0, 2)

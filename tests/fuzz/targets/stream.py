@@ -20,7 +20,6 @@ from hal.net.fair_share import Share
 from tests.daemon.publish.modbus.test_registers import snapshot
 
 MEGABYTES = 10
-PARSERS = ("daemon/publish/stream/session.py",)
 TILES, TILE_SIZE = 400, 600
 """Of the map: as many as of a large hall."""
 TURN_S = 0.04

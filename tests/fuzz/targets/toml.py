@@ -11,15 +11,6 @@ from tests.daemon.support.map_maker import SURVEY
 from tests.fuzz.targets import a_file, refused
 
 MEGABYTES = 3
-PARSERS = (
-    "daemon/config/loader.py",
-    "daemon/config/errors.py",
-    "daemon/config/schema.py",
-    "daemon/config/survey_loader.py",
-    "daemon/config/survey_schema.py",
-    "daemon/config/survey_errors.py",
-    "daemon/maps/map_server.py",
-)
 
 DESCRIPTION = (
     b"image: a.pgm\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from tools.bench import crispness, maps
-from tools.bench.against import Compared, read, regressions
 from tools.bench.crispness import LOGS, best_peer, load
 from tools.bench.maps import thickness
-from tools.bench.report import About, Figure, Result, page, write
+from tools.bench.report.against import Compared, read, regressions
+from tools.bench.report.page import page, write
+from tools.bench.report.result import About, Figure, Result
 from tools.bench.system import aarch64, latency
 from tools.ci.figures import bounded
 

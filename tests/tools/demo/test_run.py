@@ -34,8 +34,7 @@ def reading(state: State = State.TRACKING, pose: tuple[float, float, float] | No
 
 def test_truth_is_turned_into_the_map() -> None:
     """The map's origin is where the robot truly stood at (1, 2) facing north; it has driven 3 m north since."""
-    origin = ((0.0, 0.0, 0.0), (1.0, 2.0, math.pi / 2))
-    seen = in_map((1.0, 5.0, math.pi / 2), origin)
+    seen = in_map((1.0, 5.0, math.pi / 2), (1.0, 2.0, math.pi / 2), (0.0, 0.0, 0.0))
     assert seen == pytest.approx((3.0, 0.0, 0.0), abs=1e-12)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from estimator.light_filter.survey import Survey
 from estimator.paper.lateration import Solver, SolverSettings
 from tools.experiments.paper_figures import fig4, fig4_recorded
-from tools.experiments.places import CENTRED, error, grid, sheet_of, spots
-from tools.experiments.report import Work
+from tools.experiments.support.places import CENTRED, error, grid, sheet_of, spots
+from tools.experiments.support.report import Work
 from tools.sim.building.world import Plan
 from tools.sim.ceiling.ceiling import IDEAL, Ceiling
 from tools.sim.ceiling.lamps import row, with_codes

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.experiments import corridor, survey, tones, walks
+from tools.experiments import corridor, survey
 from tools.experiments.corridor_bound import Seen, Sizes, bound
-from tools.experiments.report import Work
+from tools.experiments.recorded import tones, walks
+from tools.experiments.support.report import Work
 
 NOTHING = Sizes(0.0, 0.0, 0.0, 0.0, 0.0)
 

@@ -12,8 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from tools.bench.vm.places import LEASH
-
+LEASH: Final = ("setpriv", "--pdeathsig", "KILL")
+"""Before the words of a program: it ends with the one that started it, however that ends."""
 ROOT: Final = Path(__file__).parents[3]
 SILENT_S: Final = 120.0
 """From one line of a program to its next: a stretch takes 10 s, a start with compiled kernels a few, on a busy machine

@@ -46,7 +46,7 @@ from hal.port.port import PortOpener
 from hal.timerfd import timer
 from tools.bench.support.drive import PERIOD_S, Delivery
 from tools.bench.support.first import first_in_line
-from tools.bench.system.liveloop import SUBMAPS, old_map
+from tools.bench.support.old_map import SUBMAPS, old_map
 
 SETTLE_S: Final = 8.0
 SHIFT_S: Final = 2e-4

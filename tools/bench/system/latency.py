@@ -6,6 +6,11 @@ itself; *alone*, beside two burners that walk through memory; and *loaded*, besi
 each, a stream client that never reads, and the graph of 1000 submaps solved without a pause. Before and after, beside
 the burners, the C program (`_timerloop.c`) waits for the same timer at the same priority.
 
+With ``--beside browsers`` twenty browsers watch `lumiloop view`, with ``--beside hanging`` eight connections want every
+topic of the stream, read nothing, and are killed. Then there are no burners, and stretches come in pairs, *alone* and
+*loaded*, every other pair the other way round (A B B A): what grows evenly cancels. The first second after a change
+counts for neither.
+
 ``make bench ARGS=latency`` takes 90 s with SCHED_FIFO and as many without; for figures that are statistically firm
 ``python -m tools.bench.system.latency --turns 30`` (16 minutes each).
 """
@@ -26,14 +31,14 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
 import numpy as np
 
 from daemon.devices.light_setup import Lights
 from daemon.runtime.warmup import load
 from daemon.system.realtime import PRIORITY
 from estimator.cdma.air_interface import PROFILE_A
-from tools.bench.support.children import CannotRun, child, ended, finished, lines, two_counts
+from tools.bench.support.beside import BROWSERS, KINDS, Beside, Readers, free_port
+from tools.bench.support.children import CannotRun, child, ended, finished, lines
 from tools.bench.support.drive import PERIOD_S, EndlessDrive
 from tools.bench.support.paced import SETTLE_S
 from tools.ci.figures import Figure, bounded, save, table
@@ -42,13 +47,13 @@ COMMAND: Final = "python -m tools.bench.system.latency"
 STRETCH_S: Final = 10.0
 BARE_S: Final = 10.0
 BURNERS: Final = 2
-TELLING: Final = ("pose", "lights", "scan", "state", "loop")
 COMPILE_S: Final = 60.0
+CHANGE_S: Final = 1.0
+LEAST_HZ: Final = 15.0
+"""Messages a second to each browser; with fewer, nothing was watched that would cost anything (a page has 25)."""
 LATE_S: Final = 60.0
 """By so much a bare loop may be later than its turns take."""
-CONNECT_S: Final = 10.0
 DAEMON: Final = (sys.executable, "-m", "tools.bench.support.paced")
-READERS: Final = (sys.executable, "-m", "tools.bench.support.readers")
 
 
 def compiled(folder: Path) -> Path:
@@ -99,77 +104,40 @@ def prepared(folder: Path, seconds: float) -> Path:
     return path
 
 
-class Load:
-    """The readers and the stuck client, on and off."""
-
-    def __init__(self, modbus: int, stream: str, undo: ExitStack) -> None:
-        self._stream = stream
-        self._stuck: socket.socket | None = None
-        undo.callback(self._let_go)
-        self._readers = undo.enter_context(child(*READERS, str(modbus), hear=True))
-        self._readers.send_signal(signal.SIGSTOP)
-
-    def turn(self, on: bool) -> None:
-        """On or off."""
-        self._readers.send_signal(signal.SIGCONT if on else signal.SIGSTOP)
-        self._let_go()
-        if on:
-            self._stuck = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            self._stuck.settimeout(CONNECT_S)
-            want = msgspec.msgpack.encode({"want": list(TELLING)})
-            try:
-                self._stuck.connect(self._stream)
-                self._stuck.sendall(len(want).to_bytes(4, "little") + want)
-            except OSError as error:
-                raise CannotRun(f"the daemon's stream takes no client: {error}") from error
-
-    def _let_go(self) -> None:
-        if self._stuck is not None:
-            self._stuck.close()
-            self._stuck = None
-
-    def end(self) -> tuple[int, int]:
-        """Requests asked and answered."""
-        self._let_go()
-        self._readers.send_signal(signal.SIGCONT)
-        return two_counts(self._readers, "the readers")
-
-
-def paced(folder: Path, drive: Path, fifo: bool, turns: int, burn: Callable[[bool], None]) -> dict[str, Any]:
-    """One run of the daemon: what it told, with the readers' counts."""
+def paced(
+    folder: Path, wanted: dict[str, Any], make: Callable[[str, int], Beside], burn: Callable[[bool], None]
+) -> dict[str, Any]:
+    """One run of the daemon: its outcome, with the counts of what is ``make``-d of its stream and its Modbus port."""
+    stream, modbus = str(folder / "stream"), free_port()
     with ExitStack() as undo:
         sink = undo.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         sink.bind(("127.0.0.1", 0))
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            modbus = int(free.getsockname()[1])
-        stream = str(folder / "stream")
-        wanted = {
-            "drive": str(drive), "stream": stream, "modbus": modbus, "fifo": fifo, "turns": turns,
-            "receiver": f"127.0.0.1:{sink.getsockname()[1]}", "stretch_s": STRETCH_S,
-            "quiet": True,
-        }  # fmt: skip
-        daemon = undo.enter_context(child(*DAEMON, json.dumps(wanted), ask=True, hear=True))
-        load = Load(modbus, stream, undo)
+        ends = {"stream": stream, "modbus": modbus, "receiver": f"127.0.0.1:{sink.getsockname()[1]}"}
+        words = json.dumps(wanted | ends | {"stretch_s": STRETCH_S})
+        beside = make(stream, modbus)
+        undo.callback(beside.kill)
+        daemon = undo.enter_context(child(*DAEMON, words, ask=True, hear=True))
         assert daemon.stdin is not None
-        asked = answered = 0
-        for line in lines(daemon, "the daemon"):
+        counts, on = (0, 0), False
+        for line in map(str.strip, lines(daemon, "the daemon")):
             if line.startswith("told "):
                 if ended(daemon, "the daemon"):
                     break
                 outcome: dict[str, Any] = json.loads(line[5:])
-                return outcome | {"asked": asked, "answered": answered}
-            if line.strip() == "ended":  # it still serves: what is asked until now is answered
-                asked, answered = load.end()
+                return outcome | {"counts": counts}
+            if line == "ended":  # it still serves: what is asked until now is answered
+                counts = beside.end()
                 daemon.stdin.close()
-            else:
-                load.turn(line.strip() == "loaded")
-                burn(line.strip() != "quiet")
+                continue
+            if (line == "loaded") != on:
+                on = not on
+                beside.turn(on)
+            burn(line != "quiet")
     raise CannotRun("the daemon ended before its time; its log says why")
 
 
 def measure(turns: int, fifos: tuple[bool, ...] = (True, False)) -> dict[str, dict[str, Any]]:
-    """Both runs, by name."""
+    """Both runs beside readers, by name."""
     load(Lights(EndlessDrive().survey, PROFILE_A))
     found = {}
     with tempfile.TemporaryDirectory() as name:
@@ -178,9 +146,63 @@ def measure(turns: int, fifos: tuple[bool, ...] = (True, False)) -> dict[str, di
         for fifo in fifos:
             with burning(program) as burn:
                 before = bare(program, fifo)
-                told = paced(folder, drive, fifo, turns, burn)
+                wanted = {"drive": str(drive), "fifo": fifo, "turns": turns, "quiet": True}
+                told = paced(folder, wanted, Readers, burn)
+                told["asked"], told["answered"] = told["counts"]
                 told["bare"] = before + bare(program, fifo)
             found["SCHED_FIFO" if fifo else "ordinary"] = told
+    return found
+
+
+def in_pairs(kind: str, turns: int) -> list[Figure]:
+    """What browsers, or taps that hang, change: stretches in pairs, every other pair the other way round."""
+    load(Lights(EndlessDrive().survey, PROFILE_A))
+    command = f"{COMMAND} --beside {kind}"
+    with tempfile.TemporaryDirectory() as name:
+        drive = prepared(Path(name), SETTLE_S + 2 * turns * STRETCH_S)
+        wanted = {"drive": str(drive), "fifo": os.geteuid() == 0, "turns": turns, "solve": False, "change_s": CHANGE_S}
+        told = paced(Path(name), wanted, KINDS[kind], lambda on: None)
+    rows = compared(told, kind, command)
+    if kind == "browsers":
+        each_s = turns * STRETCH_S * BROWSERS
+        messages, size = told["counts"]
+        rows.append(Figure("kB a second to each browser", 1e-3 * size / each_s, "", command=command))
+        name = "messages a second to each browser"
+        rows.append(bounded(name, messages / each_s, "", f">= {LEAST_HZ:g}", command))
+    return rows
+
+
+def compared(told: dict[str, Any], other: str, command: str) -> list[Figure]:
+    """What is later, and what takes longer, in the stretches that are ``other``."""
+    rows = []
+    for what in ("late", "cycle"):
+        alone, loaded = (1e-3 * np.array(told[what][stretch]) for stretch in ("alone", "loaded"))
+        words = {"late": "cycles begin late", "cycle": "a cycle takes"}[what]
+        for q in (50.0, 99.0):
+            rows.append(Figure(f"{words}, p{q:g}, alone", float(np.percentile(alone, q)), "ms", command=command))
+            rows.append(Figure(f"{words}, p{q:g}, {other}", float(np.percentile(loaded, q)), "ms", command=command))
+        more = float(np.percentile(loaded, 99) - np.percentile(alone, 99))
+        rows.append(bounded(f"{words}, p99, {other} over alone", more, "ms", "<= 0.5", command))
+        pairs = by_pair(told, what)
+        name = f"{words}, p99, {other} over alone, of {len(pairs)} pairs"
+        rows.append(bounded(f"{name}, median", float(np.median(pairs)), "ms", "<= 0.5", command))
+        for q, end in ((25.0, "lower quarter"), (75.0, "upper quarter")):
+            rows.append(Figure(f"{name}, {end}", float(np.percentile(pairs, q)), "ms", command=command))
+    counted = float(sum(len(stretch) for stretch in told["late"].values()))
+    rows.append(Figure(f"cycles, alone and {other}", counted, "", command=command))
+    rows.append(Figure("scans missed", float(told["missed"]), "", command=command))
+    return rows
+
+
+def by_pair(told: dict[str, Any], what: str) -> list[float]:
+    """What p99 is higher by, loaded, in each pair of stretches, ms."""
+    found = []
+    for number in sorted(set(told["pair"]["alone"]) & set(told["pair"]["loaded"])):
+        alone, loaded = (
+            np.percentile(1e-3 * np.array(told[what][stretch])[np.array(told["pair"][stretch]) == number], 99)
+            for stretch in ("alone", "loaded")
+        )
+        found.append(float(loaded - alone))
     return found
 
 
@@ -245,26 +267,30 @@ def _costs(name: str, told: dict[str, Any]) -> list[Figure]:
     ]
 
 
-def run(turns: int = 2) -> list[Figure]:
+def run(turns: int = 2, beside: str = "readers") -> list[Figure]:
     """Some 60 s of cycles with SCHED_FIFO, where it may be had, and as many without."""
+    if beside != "readers":
+        return in_pairs(beside, turns)
     fifos = (True, False) if os.geteuid() == 0 else (False,)
     return figures(measure(turns, fifos))
 
 
-def long_form(name: str, prog: str, other: str, run: Callable[[int], list[Figure]]) -> None:
-    """The command by itself, for figures that are firm; ``other``: what every second stretch is."""
-    parser = argparse.ArgumentParser(prog=prog)
-    parser.add_argument("--turns", type=int, default=30, help=f"times 10 s alone and 10 s {other}")
+def main() -> None:
+    """The command by itself, for figures that are firm."""
+    parser = argparse.ArgumentParser(prog=COMMAND)
+    parser.add_argument("--beside", choices=sorted(KINDS), default="readers", help="clients of every other stretch")
+    parser.add_argument("--turns", type=int, default=30, help="times 10 s alone and 10 s loaded")
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # daemon, readers and burners must not outlive this one
     try:
-        rows = run(options.turns)
+        rows = run(options.turns, options.beside)
     except CannotRun as reason:
-        sys.exit(f"{name} could not run: {reason}")
+        sys.exit(f"latency could not run: {reason}")
     print(table(rows))
+    name = "latency" if options.beside == "readers" else f"latency-{options.beside}"
     print(f"written: {save(name, rows, options.out)}")
 
 
 if __name__ == "__main__":
-    long_form("latency", COMMAND, "loaded", run)
+    main()

@@ -16,7 +16,6 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -32,7 +31,7 @@ from daemon.runtime.warmup import load
 from daemon.runtime.worker import ThreadWorker, Worker
 from daemon.system.realtime import line_up
 from estimator.job_queue import SEARCH
-from estimator.mapping.keyframe import Settled, Submap
+from estimator.mapping.keyframe import Settled
 from estimator.mapping.loop_closure import found_again
 from estimator.mapping.loop_verification import Found, LoopSettings
 from estimator.measurements import Array, Job
@@ -40,22 +39,18 @@ from estimator.numerics import se2
 from estimator.pipeline import State, new_state, step
 from hal.adc import RawSamples
 from hal.lidar import LidarStatus, Link
-from tools.bench.cycle import Hands
 from tools.bench.support.drive import Delivery, EndlessDrive
 from tools.bench.support.first import before_others
+from tools.bench.support.manual_clock import ManualClock
+from tools.bench.support.old_map import SUBMAPS, old_map
 from tools.bench.support.stages import WALL, Stages, quantiles
 from tools.ci.figures import Figure, bounded, save, table
 
 COMMAND: Final = "python -m tools.bench.system.liveloop"
-SUBMAPS: Final = 1000
 BLOCK: Final = 200
 """Scans that one cycle takes before the other has its turn."""
 EVERY: Final = 40
 """Scans from one loop to the next."""
-STEP_M: Final = 3.0
-ROW: Final = 20
-"""Submaps in a row of the serpentine that the old map is."""
-NOISE: Final = np.array((0.02, 0.02, 0.004))
 MOVED: Final = np.array((0.08, 0.0, 0.0))
 
 
@@ -82,32 +77,6 @@ class Idle:
         """See :class:`daemon.runtime.worker.Worker`."""
 
 
-def old_map(state: State, count: int, settled: Settled | None = None, seed: int = 0) -> None:
-    """Lay ``count`` submaps up and down a hall, rows joined by loops, that end where the robot starts."""
-    rng, atlas, P = np.random.default_rng(seed), state.map.graph, np.diag(NOISE**2)
-    turn = [np.pi / 2 * (1 if (k // ROW) % 2 == 0 else -1) if k % ROW >= ROW - 2 else 0.0 for k in range(count)]
-    truth = [np.array((100.0, 0.0, 0.0))]
-    for k in range(count - 1):
-        truth.append(se2.compose(truth[-1], np.array((STEP_M, 0.0, turn[k]))))
-    home = np.array((60.0, 60.0, 0.0))
-    place = [se2.compose(home, se2.between(truth[-1], T)) for T in truth]
-    place[-1] = se2.identity()
-    way = [se2.compose(se2.between(a, b), NOISE * rng.standard_normal(3)) for a, b in pairwise(place)]
-    laid = [se2.identity()]
-    for T in reversed(way):
-        laid.append(se2.compose(laid[-1], se2.inverse(T)))
-    for k, T in enumerate(reversed(laid)):
-        atlas.submaps[k + 1] = Submap(k + 1, -count + k, T, T, STEP_M * (k - count) - 100.0, settled)
-        if k:
-            atlas.constraints.add(k, k + 1, way[k - 1], P, False)
-    for k in range(ROW, count - 1, 3):
-        near = int(np.argmin([np.hypot(*(place[i] - place[k])[:2]) for i in range(k - ROW // 2)]))
-        T = se2.compose(se2.between(place[near], place[k]), NOISE * rng.standard_normal(3))
-        if np.hypot(*T[:2]) < 2.5 * STEP_M:
-            atlas.constraints.add(near + 1, k + 1, T, P, True)
-    atlas.stale = True
-
-
 @dataclass(slots=True)
 class Side:
     """One of the two: its estimator, its cycle, its times, and its latencies in ms."""
@@ -121,7 +90,7 @@ class Side:
     taken: int = 0
 
 
-def side(drive: EndlessDrive, count: int, clock: Hands, worker: Worker) -> Side:
+def side(drive: EndlessDrive, count: int, clock: ManualClock, worker: Worker) -> Side:
     """A cycle around an estimator of its own."""
     x, y, yaw = drive.scene.mount
     state = new_state()
@@ -170,7 +139,7 @@ def pass_by(one: Side, due: Delivery, number: int) -> None:
 def measure(seconds: float, submaps: int = SUBMAPS, settle_s: float = 10.0, pace_s: float = 0.025) -> tuple[Side, Side]:
     """Both sides after so many seconds each: the one with the large map, and the one without."""
     load()
-    drive, clock = Drive(), Hands()
+    drive, clock = Drive(), ManualClock()
     warm, count = round(settle_s / 0.025), BLOCK * max(round(seconds / 0.025 / BLOCK), 1)
     worker = ThreadWorker()
     line_up()

@@ -12,8 +12,9 @@ import sys
 import time
 from pathlib import Path
 
-from tools.bench.against import CannotCompare, read
-from tools.bench.report import About, CannotReport, Result, demand_apart, demand_room, facts, write
+from tools.bench.report.against import CannotCompare, read
+from tools.bench.report.page import CannotReport, demand_apart, demand_room, facts, write
+from tools.bench.report.result import About, Result
 from tools.bench.vm.booted import Booted, booted
 from tools.bench.vm.common import Scenario
 from tools.bench.vm.guests import Guest, run_all

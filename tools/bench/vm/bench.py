@@ -12,7 +12,6 @@ import subprocess
 import sys
 import threading
 import time
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -20,12 +19,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from tools.bench.system.otherclock import OtherClock
+from tools.bench.support.children import LEASH
+from tools.bench.support.other_clock import OtherClock
 from tools.bench.vm.booted import Booted
 from tools.bench.vm.image import ROOT
 from tools.bench.vm.machine import OUTSIDE, Machine, Order, Ports, free_for_both, free_port, started
-from tools.bench.vm.places import LEASH, CannotBench
+from tools.bench.vm.places import CannotBench
 from tools.clients.read_modbus import Reader
+from tools.sim.robot.truth import Pose, at_time, in_map
 
 UNIT: Final = "lumiloop.service"
 CONFIG: Final = "/etc/lumiloop/lumiloop.toml"
@@ -41,7 +42,6 @@ LOOK_S: Final = 0.2
 READS: Final = 4
 BUSY: Final = 5.0
 """No bound is stretched beyond so many times its seconds."""
-Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,13 +85,7 @@ class Ears:
     def true_pose(self, t: float) -> Pose | None:
         """Where the robot really was at ``t`` (this computer's clock, s): x, y, yaw in the room's frame, m and rad."""
         told = list(self.truth)
-        at = bisect_left(told, (t,))
-        if at == 0 or at == len(told):
-            return told[-1][1] if told and at else None
-        (t0, a), (t1, b) = told[at - 1], told[at]
-        share = (t - t0) / (t1 - t0)
-        turn = math.remainder(b[2] - a[2], math.tau)
-        return (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * turn)
+        return told[-1][1] if told and t > told[-1][0] else at_time(told, t)
 
 
 def heard(data: bytes, now: float, clock: OtherClock) -> Heard:
@@ -106,13 +100,6 @@ def heard(data: bytes, now: float, clock: OtherClock) -> Heard:
     if pose is None:
         return Heard(now, now, state, None, sigma, *counts)
     return Heard(now, clock.here(t_mono / 1e6, t_mono / 1e6 + age / 1e4, now), state, pose, sigma, *counts)
-
-
-def inverse_then(frame: Pose, pose: Pose) -> Pose:
-    """``pose`` seen from ``frame``: x, y, yaw, m and rad, as both are."""
-    dx, dy = pose[0] - frame[0], pose[1] - frame[1]
-    c, s = math.cos(frame[2]), math.sin(frame[2])
-    return (c * dx + s * dy, -s * dx + c * dy, math.remainder(pose[2] - frame[2], math.tau))
 
 
 class Bench:
@@ -272,7 +259,7 @@ class Bench:
         true = self.ears.true_pose(one.t_pose)
         if one.pose is None or true is None or self.start is None:
             return None
-        x, y, _ = inverse_then(self.start, true)
+        x, y, _ = in_map(true, self.start, (0.0, 0.0, 0.0))
         return math.hypot(one.pose[0] - x, one.pose[1] - y)
 
     def collect(self, seconds: float) -> list[Heard]:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final, Literal
 
-from tools.bench.report import Seen
+from tools.bench.report.result import Seen
 from tools.bench.vm.bench import PLACED, UNIT, Bench, Heard
 from tools.bench.vm.machine import Machine, Order, all_well
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from tools.bench.report import Figure, Result, Seen
+from tools.bench.report.result import Figure, Result, Seen
 from tools.bench.vm.bench import Bench, bench
 from tools.bench.vm.booted import Booted
 from tools.bench.vm.common import AFTER, ALONE, Scenario, Unmet, unnoticed

@@ -21,8 +21,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from tools.bench.support.children import LEASH
 from tools.bench.vm import whole
-from tools.bench.vm.places import LEASH, CannotBench, cache, clear, discard, held, missing, workspace
+from tools.bench.vm.places import CannotBench, cache, clear, discard, held, missing, workspace
 
 ROOT = Path(__file__).parents[3]
 GUEST = Path(__file__).parent / "guest"

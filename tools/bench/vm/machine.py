@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from tools.bench.support.children import LEASH
 from tools.bench.vm.image import Image
-from tools.bench.vm.places import LEASH, BrokenOff, CannotBench, remedy
+from tools.bench.vm.places import BrokenOff, CannotBench, remedy
 
 BOOT_S, QUIT_S, LOOK_S, KEEP_S = 400.0, 10.0, 0.5, 120.0
 DEAF_S = 60.0

@@ -27,10 +27,6 @@ BUILDING = frozenset({"qemu-img", "mmdebstrap", "mkfs.ext4", "dpkg-deb", "chroot
 """Those that only making an image takes; running one takes QEMU alone."""
 
 
-LEASH = ("setpriv", "--pdeathsig", "KILL")
-"""Before the words of a program: it ends with the one that started it, however that ends."""
-
-
 class CannotBench(Exception):
     """The bench cannot run here; the text says what is missing and how to get it."""
 

@@ -11,9 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from tools.bench.plots import Plot, Series, histogram
-from tools.bench.report import Figure, Seen
-from tools.bench.vm.bench import CONFIG, DONE, PLACED, SAVE_MAP, UNIT, Bench, Heard, inverse_then
+from tools.bench.report.plots import Plot, Series, histogram
+from tools.bench.report.result import Figure, Seen
+from tools.bench.vm.bench import CONFIG, DONE, PLACED, SAVE_MAP, UNIT, Bench, Heard
 from tools.bench.vm.common import (
     BUDGET,
     TRACKING_S,
@@ -30,6 +30,7 @@ from tools.bench.vm.common import (
 from tools.bench.vm.machine import Order
 from tools.bench.vm.reference import DRIVE_S, outside
 from tools.bench.world.room import LIDAR
+from tools.sim.robot.truth import in_map
 
 FIFO: Final = 1
 MARKS: Final = "/var/cache/private/lumiloop/kernels-*/warm-*"
@@ -287,7 +288,7 @@ def _way(bench: Bench, heard: list[Heard]) -> Plot:
     if bench.start is None:
         raise Order("where it began is not known")
     begun = heard[0].t_pose if heard else 0.0
-    true = [inverse_then(bench.start, pose) for t, pose in list(bench.ears.truth) if t >= begun]
+    true = [in_map(pose, bench.start, (0.0, 0.0, 0.0)) for t, pose in list(bench.ears.truth) if t >= begun]
     said = [one.pose for one in heard if one.pose is not None]
     lines = (("truth", true), ("published", said))
     series = tuple(Series(name, [x for x, _, _ in line], [y for _, y, _ in line]) for name, line in lines)

@@ -28,9 +28,9 @@ from hal.fake.transport.tcp_server import TcpServer
 from tools.bench.world.room import LIDAR, room
 from tools.bench.world.stage import ForeignSender
 from tools.sim.feed import UdpSender, feed_odometry, feed_truth
-from tools.sim.hands import Hands
-from tools.sim.odometry import Wheels
-from tools.sim.robot import Body
+from tools.sim.robot.drive import Body
+from tools.sim.robot.hands import Hands
+from tools.sim.robot.odometry import Wheels
 from tools.sim.scene import Scenario, SimulatedScene
 
 BUS = "bench"

@@ -24,8 +24,9 @@ from typing import Final
 
 from daemon.runtime.warmup import CannotLoad
 from hal.errors import HalError
-from tools.bench.against import SCENARIO, Before, CannotCompare, digest, read
-from tools.bench.report import About, CannotReport, Result, demand_apart, demand_room, facts, write
+from tools.bench.report.against import SCENARIO, Before, CannotCompare, digest, read
+from tools.bench.report.page import CannotReport, demand_apart, demand_room, facts, write
+from tools.bench.report.result import About, Result
 from tools.bench.world import agreement
 from tools.bench.world.judge import Played, judged, pictures
 from tools.bench.world.local import robot, warm

@@ -16,11 +16,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from tools.bench.plots import Plot, Series
-from tools.bench.report import Figure
-from tools.bench.world.judge import Errors, Played, errors_of, seen_from
+from tools.bench.report.plots import Plot, Series
+from tools.bench.report.result import Figure
+from tools.bench.world.judge import Errors, Played, errors_of
 from tools.bench.world.scenario import Scenario
 from tools.sim.harness import run
+from tools.sim.robot.truth import in_map
 from tools.sim.scene import SimulatedScene
 
 Array = npt.NDArray[np.float64]
@@ -51,7 +52,7 @@ def trace_of(t: Array, poses: Array, truth_t: Array, truth: Array) -> Trace:
     """Of poses in a map that begins where the robot truly is first, and of the truth in a frame of its own."""
     start, t0 = truth[0], truth_t[0]
     true = np.column_stack([np.interp(t, truth_t, truth[:, k]) for k in range(2)] + [np.zeros(len(t))])
-    off = poses - seen_from(start, np.zeros(3), true)
+    off = poses - in_map(true, start, np.zeros(3))
     return _trace(Errors(t - t0, off, poses, np.zeros(len(t))), truth_t - t0, truth)
 
 

@@ -10,11 +10,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from tools.bench.plots import Plot, Series, histogram
-from tools.bench.report import Figure, Seen
+from tools.bench.report.plots import Plot, Series, histogram
+from tools.bench.report.result import Figure, Seen
 from tools.bench.world.scenario import GAP_S, Expectation, Scenario
 from tools.clients.read_modbus import STATES
-from tools.sim.robot import Body
+from tools.sim.robot.drive import Body
+from tools.sim.robot.truth import in_map
 
 Array = npt.NDArray[np.float64]
 Pose = tuple[float, float, float]
@@ -110,7 +111,7 @@ def errors_of(played: Played) -> Errors:
     start = played.truth(np.zeros(1))[0]
     told = middle_of(np.array(played.standing, dtype=np.float64).reshape(-1, 3))
     site = played.truth(t) if len(t) else np.zeros((0, 3))
-    truth = seen_from(start, told, site)
+    truth = in_map(site, start, told)
     t_site = math.inf
     if played.lamps and len(t):
         nearer = np.hypot(*(pose - site)[:, :2].T) < np.hypot(*(pose - truth)[:, :2].T)
@@ -129,14 +130,6 @@ def middle_of(poses: Array) -> Array:
     turned = poses - first
     turned[:, 2] = np.remainder(turned[:, 2] + np.pi, 2.0 * np.pi) - np.pi
     return np.asarray(np.median(turned, axis=0) + first)
-
-
-def seen_from(at: Array, pose: Array, truth: Array) -> Array:
-    """True poses (n, 3) as seen from the map in which the robot, truly ``at``, has ``pose``."""
-    turn = pose[2] - at[2]
-    c, s = np.cos(turn), np.sin(turn)
-    dx, dy = truth[:, 0] - at[0], truth[:, 1] - at[1]
-    return np.column_stack([pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, truth[:, 2] + turn])
 
 
 def judged(expected: Expectation, played: Played) -> tuple[bool, Seen]:

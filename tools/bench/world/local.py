@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from daemon.runtime import warmup
-from tools.bench.report import ROOT
-from tools.bench.vm.places import LEASH
+from tools.bench.report.page import ROOT
+from tools.bench.support.children import LEASH
 from tools.bench.world.scenario import Scenario
 from tools.bench.world.stage import CannotPlay, Ends
 from tools.sim.light.serve import write_plan

@@ -15,7 +15,7 @@ from hal.fake.faults.schedule import Target
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import LidarModel
 from hal.fake.lidar.scan_world import Room
-from tools.sim import hands
+from tools.sim.robot import hands
 
 
 def check(tables: Sequence[Mapping[str, Any]], lidar: LidarModel, lamps: bool) -> None:

@@ -6,9 +6,10 @@ from dataclasses import replace
 from typing import Final
 
 from hal.fake.lidar.models import MODELS, PAPER, LidarModel
-from tools.sim.building.buildings import Building, building
+from tools.sim.building.building import Building
+from tools.sim.building.buildings import building
 from tools.sim.building.world import Plan
-from tools.sim.robot import Route
+from tools.sim.robot.drive import Route
 
 BENCH: Final = "bench"
 LIDAR: Final[LidarModel] = replace(

@@ -44,7 +44,7 @@ from tools.bench.world import orders, room
 from tools.clients.read_modbus import STATES
 from tools.sim.building.buildings import BUILDINGS
 from tools.sim.light.scene import Lights
-from tools.sim.robot import Body
+from tools.sim.robot.drive import Body
 from tools.sim.scene import Scenario as SceneScenario
 from tools.sim.scene import SimulatedScene
 

@@ -27,7 +27,7 @@ from hal.fake.lidar.models import Unit
 from hal.fake.transport.pty_server import PtyServer
 from hal.fake.transport.tcp_server import TcpServer
 from hal.net.input_codec import decode, encode
-from tools.bench.system.otherclock import OtherClock
+from tools.bench.support.other_clock import OtherClock
 from tools.bench.world.dac import DacThread
 from tools.bench.world.judge import Played, Pose, Read
 from tools.bench.world.scenario import Scenario
@@ -35,8 +35,8 @@ from tools.bench.world.serialend import SerialEnd
 from tools.clients.read_lights import Reader as LightReader
 from tools.clients.read_modbus import Reader
 from tools.sim.feed import UdpSender, feed_odometry
-from tools.sim.hands import Hands
 from tools.sim.light.serve import BUS, converter
+from tools.sim.robot.hands import Hands
 from tools.sim.scene import SimulatedScene
 
 LINES: Final = "/dev/ttyUSB0, /dev/ttyUSB0@115200, pty:PATH or tcp://HOST:PORT"

@@ -1,19 +1,16 @@
 """Integrity: is what the daemon says of random drives ever wrong?
 
-``python -m tools.experiments.integrity --count 10``; resumable, one file a scenario.
+``python -m tools.experiments --only integrity --trials 10``; resumable, one file a scenario.
 
 Every scenario of :mod:`tools.experiments.integrity.scene` goes through the daemon's own cycle in virtual time; the
-published state is judged against the truth. Tracks are kept in ``<out>/<kind>-<seed>.npz`` and not made again; delete
-them to begin anew. ``--report`` only says what the kept ones show; ``--plot FILE`` draws error against bound.
+published state is judged against the truth. Tracks are kept in ``out/integrity/<code>/<kind>-<seed>.npz``
+and not made again; delete them to begin anew.
 """
 
 from __future__ import annotations
 
-import argparse
 import logging
-import sys
 import time
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Final
 
@@ -22,10 +19,9 @@ import numpy as np
 from tools.ci.figures import bounded
 from tools.experiments.integrity import run as integrity_run
 from tools.experiments.integrity.plot import stanford
-from tools.experiments.integrity.report import Summary, report
+from tools.experiments.integrity.report import KIND_HEAD, Summary, report
 from tools.experiments.integrity.scene import KINDS, draw
-from tools.experiments.report import COMMAND, Picture, Report, Table, Work, code
-from tools.experiments.report import draw as pictured
+from tools.experiments.support.report import COMMAND, Picture, Report, Table, Work, code
 
 OUT: Final = Path("out/integrity")
 SEEDS: Final = 60
@@ -75,50 +71,11 @@ def told(found: Summary, seeds: range) -> Report:
     figure = bounded(f"wrong states, of {len(found.found)} scenarios", found.wrong, "", "<= 0", f"{COMMAND} integrity")
     picture = Picture("stanford", lambda canvas: stanford(found, canvas, ALERT_M), (6.4, 5.2))
     notes = tuple(line.strip() for line in found.figures())
-    tables = (Table("Scenarios in which a state or a bound was wrong", head, tuple(rows)),) if rows else ()
+    kinds = Table("By kind of scenario", KIND_HEAD, found.kinds())
+    tables = (kinds, Table("Scenarios in which a state or a bound was wrong", head, tuple(rows))) if rows else (kinds,)
     return Report((figure,), tables, (picture,), tuple(seeds), notes)
 
 
 def missing(kinds: list[str], seeds: range, out: Path) -> list[tuple[str, int, Path]]:
     """Scenarios that have no track yet, seed by seed, so that every kind has its share whenever it is stopped."""
     return [(kind, seed, out) for seed in seeds for kind in kinds if not (out / f"{kind}-{seed}.npz").exists()]
-
-
-def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Options; an unknown kind ends the program with the list of those that there are."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.experiments.integrity", description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
-    parser.add_argument("--kind", action="append", choices=sorted(KINDS), help="only this kind (may be repeated)")
-    parser.add_argument("--count", type=int, default=2, help="seeds of each kind (default: 2)")
-    parser.add_argument("--first", type=int, default=0, help="first seed (default: 0)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder of the tracks")
-    parser.add_argument("--report", action="store_true", help="run nothing, say what the kept tracks show")
-    parser.add_argument("--plot", type=Path, help="PNG to draw error against bound into")
-    parser.add_argument("--alert", type=float, default=ALERT_M, help="alert limit in the plot, m (default: 1)")
-    return parser.parse_args(arguments)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run what is missing, then report; exit status 1 where a state was wrong for too long."""
-    options = parse(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    kinds = options.kind or list(KINDS)
-    if not options.report:
-        tasks = missing(kinds, range(options.first, options.first + options.count), options.out)
-        with get_context("spawn").Pool(options.jobs) as pool:
-            for number, (kind, seed, seconds) in enumerate(pool.imap_unordered(make, tasks), 1):
-                print(f"{number}/{len(tasks)} {kind} {seed}: {seconds:.1f} s", file=sys.stderr, flush=True)
-    found = report(options.out, kinds)
-    print(found.text())
-    if options.plot is not None:
-        picture = Picture(options.plot.stem, lambda canvas: stanford(found, canvas, options.alert), (6.4, 5.2))
-        options.plot.parent.mkdir(parents=True, exist_ok=True)
-        pictured(Report(pictures=(picture,)), options.plot.parent)
-    return int(found.wrong > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -15,9 +15,9 @@ import numpy as np
 from tools.sim.building.buildings import corridor_loop
 from tools.sim.building.office import office_floor
 from tools.sim.building.people import Walker
-from tools.sim.building.world import Array, Plan, Point, World
+from tools.sim.building.world import Array, Plan, Point, SimWorld
 from tools.sim.ceiling.lamps import Fixture, fixtures, row, with_codes
-from tools.sim.robot import Route, smooth
+from tools.sim.robot.drive import Route, smooth
 
 CLEAR_M: Final = 0.42
 """The robot's centre keeps this far from everything."""
@@ -29,7 +29,7 @@ Box = tuple[float, float, float, float]
 class Place:
     """A world, its lamps as planned, a way to draw a route through it, and people."""
 
-    world: World
+    world: SimWorld
     lamps: tuple[Fixture, ...]
     route: Callable[[np.random.Generator], Route]
     walkers: tuple[Walker, ...] = ()
@@ -147,7 +147,7 @@ def _indoors(plan: Plan, zone: Box, rng: np.random.Generator, people: int) -> Pl
     return Place(world, lamps, lambda own: wander(world, zone, own), walkers)
 
 
-def wander(world: World, zone: Box, rng: np.random.Generator) -> Route:
+def wander(world: SimWorld, zone: Box, rng: np.random.Generator) -> Route:
     """A closed route through a room that keeps clear of everything; raises RuntimeError where there is none."""
     for attempt in range(TRIES):
         count = int(rng.integers(5, 9)) if attempt < TRIES // 2 else 4
@@ -166,6 +166,6 @@ def wander(world: World, zone: Box, rng: np.random.Generator) -> Route:
     raise RuntimeError("no way through this room")
 
 
-def _clear(world: World, line: Array) -> bool:
+def _clear(world: SimWorld, line: Array) -> bool:
     s = np.linspace(0.0, 1.0, 30)[:, None]
     return bool(world.clearance(line[0] + s * (line[-1] - line[0])).min() > CLEAR_M + 0.1)

@@ -10,11 +10,12 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import beta
 
 from daemon.snapshot import State
 from tools.experiments.integrity.run import COLUMNS
 from tools.experiments.integrity.scene import SETTLED_S
+from tools.experiments.support.proof import proved_share
+from tools.experiments.support.report import Cell
 
 Array = npt.NDArray[np.float64]
 
@@ -26,6 +27,11 @@ UNLIT_S: Final = 2.0
 GAP_S: Final = 0.35
 """Cycles farther apart than this do not belong to one stretch."""
 SIGMAS: Final = 5.0
+
+KIND_HEAD: Final = (
+    "kind", "runs", "wrong", "TRACKING, %", "of recoverable time, %", "cycles beyond 5 sigma", "beyond the bound",
+    "of cycles",
+)  # fmt: skip
 
 _AT: Final = {name: number for number, name in enumerate(COLUMNS)}
 
@@ -74,25 +80,17 @@ class Summary:
         """Scenarios in which TRACKING was said of a wrong place."""
         return sum(each.wrong for each in self.found)
 
-    def text(self) -> str:
-        """Tables for a person."""
-        return "\n".join([*self._kinds(), "", *self.figures(), *self._listed()])
-
-    def _kinds(self) -> list[str]:
-        lines = [
-            f"{'kind':<16} {'runs':>5} {'wrong':>5} {'track':>7} {'recov.':>7} "
-            f"{'>5 sig':>7} {'>bound':>7} {'cycles':>8}"
-        ]
+    def kinds(self) -> tuple[tuple[Cell, ...], ...]:
+        """Rows of :data:`KIND_HEAD`."""
+        rows: list[tuple[Cell, ...]] = []
         for kind in dict.fromkeys(each.name.rpartition("-")[0] for each in self.found):
             own = [each for each in self.found if each.name.rpartition("-")[0] == kind]
             weights = sum(each.recoverable_n for each in own)
             recovered = sum(each.recoverable * each.recoverable_n for each in own) / weights if weights else np.nan
-            lines.append(
-                f"{kind:<16} {len(own):>5} {sum(e.wrong for e in own):>5} {np.mean([e.tracking for e in own]):>7.1%} "
-                f"{recovered:>7.1%} {sum(e.beyond_sigma for e in own):>7} {sum(e.beyond_bound for e in own):>7} "
-                f"{sum(e.bounded for e in own):>8}"
-            )
-        return lines
+            shares = 100.0 * float(np.mean([e.tracking for e in own])), 100.0 * float(recovered)
+            counts = (sum(e.beyond_sigma for e in own), sum(e.beyond_bound for e in own), sum(e.bounded for e in own))
+            rows.append((kind, len(own), sum(e.wrong for e in own), *shares, *counts))
+        return tuple(rows)
 
     def figures(self) -> list[str]:
         """Single numbers, as sentences."""
@@ -135,20 +133,6 @@ class Summary:
                 f"{np.mean(error <= 3.0 * sigma):.1%}"
             )
         return lines
-
-    def _listed(self) -> list[str]:
-        odd = [e for e in self.found if e.wrong or e.beyond_bound or e.beyond_sigma]
-        rows = [
-            f"  {'WRONG ' if e.wrong else ''}{e.name}: {e.wrong_s:.1f} s, worst {e.worst_m:.2f} m "
-            f"{e.worst_deg:.1f} deg, beyond sigma {e.beyond_sigma}, beyond bound {e.beyond_bound}; {e.facts}"
-            for e in sorted(odd, key=lambda e: (-e.wrong, -e.wrong_s, -e.beyond_bound))
-        ]  # fmt: skip
-        return ["", "listed apart:", *rows] if rows else []
-
-
-def proved_share(wrong: int, n: int) -> float:
-    """The largest share of which so few of ``n`` would still be seen once in twenty times (Clopper-Pearson)."""
-    return float(beta.ppf(0.95, wrong + 1, n - wrong)) if wrong < n else 1.0
 
 
 def report(out: Path, kinds: Iterable[str]) -> Summary:

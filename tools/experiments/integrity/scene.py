@@ -20,8 +20,8 @@ from tools.sim.ceiling.ceiling import Ceiling, Effects
 from tools.sim.ceiling.links import EPOCH_S, PERIOD_S, Links
 from tools.sim.ceiling.movers import walkers_of
 from tools.sim.ceiling.records import frames, light_epoch, survey
-from tools.sim.odometry import Odometer, Wheels
-from tools.sim.robot import Body, Drive, leans
+from tools.sim.robot.drive import Body, Drive, leans
+from tools.sim.robot.odometry import Odometer, Wheels
 
 SECONDS: Final = 62.0
 SETTLED_S: Final = 10.0

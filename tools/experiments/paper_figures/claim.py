@@ -43,8 +43,8 @@ from tools.experiments.paper_figures.claim_pairs import (
     returns,
     way_of,
 )
-from tools.experiments.report import COMMAND, Cell, Report, Table, Work
-from tools.experiments.trajectory import Array
+from tools.experiments.support.report import COMMAND, Cell, Report, Table, Work
+from tools.experiments.support.trajectory import Array
 
 CONDITIONS: Final = (
     Condition("room, 0.5 m/s", "room", 0.5, GOOD),

@@ -12,7 +12,7 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Ints
 from estimator.scan_matching import icp
 from estimator.scan_matching.nearest_neighbour import nearest_all
-from tools.experiments.trajectory import Array
+from tools.experiments.support.trajectory import Array
 
 Axis = tuple[Array, Ints, Array]
 """Rows, start and rays of the reference."""

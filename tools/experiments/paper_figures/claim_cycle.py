@@ -13,7 +13,7 @@ import numpy as np
 from estimator.light_filter.light_channel import LightsSetup
 from estimator.measurements import UNLIMITED, Record, SampleBlock, Scan
 from estimator.pipeline import State, new_state, step
-from tools.experiments.report import Cell
+from tools.experiments.support.report import Cell
 from tools.sim.ceiling.links import PERIOD_S
 from tools.sim.light.link_drive import ROOM_WALKERS, LightRun, room_run
 from tools.sim.light.stream import LightStream

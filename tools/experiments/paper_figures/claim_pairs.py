@@ -15,15 +15,15 @@ from estimator.light_filter import light_filter
 from estimator.measurements import Odometry, Scan
 from estimator.numerics import se2
 from estimator.result import Fix
-from tools.experiments.trajectory import Array
+from tools.experiments.support.trajectory import Array
 from tools.sim.building.buildings import building
 from tools.sim.ceiling.ceiling import ceiling_of, paper_ceiling
 from tools.sim.ceiling.links import Reception
 from tools.sim.ceiling.movers import lean_of, walkers_of
 from tools.sim.ceiling.records import survey
 from tools.sim.light.link_drive import ROOM_ROUTE, ROOM_WALKERS, LightRun
-from tools.sim.odometry import Wheels
-from tools.sim.robot import Body, Drive
+from tools.sim.robot.drive import Body, Drive
+from tools.sim.robot.odometry import Wheels
 from tools.sim.scan_drive import Laser
 
 LIT, WHEELS, NONE = "lights and wheels", "wheels", "none"

@@ -19,8 +19,8 @@ from estimator.light_filter.survey import Survey
 from estimator.paper.lateration import Doubt, Solver, SolverSettings, without_floor
 from tools.ci.figures import Figure
 from tools.experiments.paper_figures.fig4_recorded import recorded
-from tools.experiments.places import CENTRED, Spot, error, grid, sheet_of, spots
-from tools.experiments.report import COMMAND, Cell, Picture, Report, Skipped, Table, Work
+from tools.experiments.support.places import CENTRED, Spot, error, grid, sheet_of, spots
+from tools.experiments.support.report import COMMAND, Cell, Picture, Report, Skipped, Table, Work
 from tools.sim.building.world import Plan
 from tools.sim.ceiling.ceiling import IDEAL, Ceiling
 from tools.sim.ceiling.lamps import row, with_codes

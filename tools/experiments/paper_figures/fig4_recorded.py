@@ -16,9 +16,9 @@ import numpy.typing as npt
 from estimator.calibration.calibrate import calibrate_lamps
 from estimator.light_filter.survey import Survey
 from estimator.paper.lateration import Doubt, Received, Solver, SolverSettings, locate
-from tools.experiments.report import Cell, Table, Work
-from tools.experiments.static import PRIORS, halves, nominal, rows_of, unit_of
-from tools.experiments.vlp import CAMPAIGNS, Campaign, campaign
+from tools.experiments.recorded.static import PRIORS, halves, nominal, rows_of, unit_of
+from tools.experiments.recorded.vlp import CAMPAIGNS, Campaign, campaign
+from tools.experiments.support.report import Cell, Table, Work
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]

@@ -23,10 +23,10 @@ from estimator.measurements import Beam, Scan
 from estimator.paper import LUMILOOP
 from estimator.paper.methods import Method
 from tools.ci.figures import Figure
-from tools.experiments.outings import Outing, fresh, outing, play, reckoned
 from tools.experiments.paper_figures.fig5_picture import Panel, draw_maps
-from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work
-from tools.experiments.trajectory import Array, Errors, Track, errors, fitted, started
+from tools.experiments.support.outings import Outing, fresh, outing, play, reckoned
+from tools.experiments.support.report import COMMAND, Cell, Picture, Report, Table, Work
+from tools.experiments.support.trajectory import Array, Errors, Track, errors, fitted, started
 
 SEEDS: Final = (1, 2, 3)
 DRIVES: Final = ("room", "tour")

@@ -18,12 +18,12 @@ from estimator.mapping.keyframe import points_of_frame
 from estimator.numerics import se2
 from estimator.pipeline import Settings, keyframe_poses, new_state
 from tools.ci.figures import bounded
-from tools.experiments.loop_drives import SIGMA_M, play, room_drive, scans
 from tools.experiments.paper_figures.fig5_picture import VIEWS, walls
 from tools.experiments.paper_figures.fig6_curves import right
 from tools.experiments.paper_figures.fig6_trial import FROM_S, LASER, LIT, Watcher
-from tools.experiments.report import COMMAND, Picture, Report, Table, Work
-from tools.experiments.trajectory import Errors, Track, errors, started
+from tools.experiments.support.loop_drives import SIGMA_M, play, room_drive, scans
+from tools.experiments.support.report import COMMAND, Picture, Report, Table, Work
+from tools.experiments.support.trajectory import Errors, Track, errors, started
 from tools.sim.building.world import Array
 from tools.sim.light.link_drive import ROOM_BODY, ROOM_WALKERS
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from tools.experiments.trajectory import Array, Track
+from tools.experiments.support.trajectory import Array, Track
 from tools.sim.building.buildings import building
 from tools.sim.building.world import CIRCLE
 

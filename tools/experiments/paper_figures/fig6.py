@@ -31,9 +31,9 @@ from tools.experiments.paper_figures.fig6_curves import (
     right,
     rule,
 )
-from tools.experiments.paper_figures.fig6_trial import COVERED, LASER, LIT, Drive, stored
+from tools.experiments.paper_figures.fig6_trial import COVERED, LASER, LIT, Drive, trial
 from tools.experiments.paper_figures.fig6_truth import STRICT
-from tools.experiments.report import COMMAND, Cell, Picture, Report, Table, Work, code
+from tools.experiments.support.report import COMMAND, Cell, Picture, Report, Table, Work, code
 
 SEEDS: Final = tuple(range(1, 52))
 KEPT: Final = Path("out/experiments")
@@ -41,7 +41,7 @@ SOURCES: Final = (
     "estimator/**/*.py",
     "tools/sim/**/*.py",
     "tools/experiments/fig6_tr*.py",
-    "tools/experiments/loop_drives.py",
+    "tools/experiments/support/loop_drives.py",
 )
 LENGTH_M: Final = 80.0
 WAYS: Final = (LIT, LASER, COVERED)
@@ -55,7 +55,7 @@ def run(quick: bool, work: Work) -> Report:
     """All drives; with ``quick`` one short one, which is not kept."""
     seeds, length = (SEEDS[:1], 40.0) if quick else (SEEDS, LENGTH_M)
     folder = None if quick else KEPT / f"fig6-{code(*SOURCES)}"
-    drives = work.map(stored, [(seed, length, folder) for seed in seeds], "fig6")
+    drives = work.map(trial, [(seed, length) for seed in seeds], "fig6", folder)
     tables = (driven(drives), number_of_conditions(drives), thresholds(drives))
     picture = Picture("fig6", partial(draw, drives), (9.0, 4.2))
     return Report(tuple(figures(drives)), tables, (picture,), tuple(seeds), NOTES)

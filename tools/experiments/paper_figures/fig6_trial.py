@@ -8,11 +8,9 @@ thresholds can be varied afterwards.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 
@@ -24,9 +22,9 @@ from estimator.measurements import LightEpoch
 from estimator.numerics import se2
 from estimator.pipeline import Settings, State, new_state
 from estimator.result import StepResult
-from tools.experiments.loop_drives import half, play, room_drive, scans
 from tools.experiments.paper_figures.fig6_truth import Truth
-from tools.experiments.trajectory import Errors, Track, errors, started
+from tools.experiments.support.loop_drives import half, play, room_drive, scans
+from tools.experiments.support.trajectory import Errors, Track, errors, started
 from tools.sim.building.world import Array
 from tools.sim.light.link_drive import ROOM_WALKERS, LightRun
 
@@ -175,23 +173,9 @@ def covered(epochs: list[LightEpoch]) -> Iterator[LightEpoch]:
         yield replace(epoch, **nothing)
 
 
-def stored(task: tuple[int, float, Path | None]) -> Drive:
-    """A drive as it was kept in a folder by an earlier run that was interrupted; else driven, and kept (None: not)."""
-    seed, length_m, folder = task
-    if folder is None:
-        return trial(seed, length_m)
-    path = folder / f"{seed}-{length_m:g}.pickle"
-    if path.exists():
-        return cast(Drive, pickle.loads(path.read_bytes()))  # of our own, a moment ago
-    drive = trial(seed, length_m)
-    folder.mkdir(parents=True, exist_ok=True)
-    path.with_suffix(".new").write_bytes(pickle.dumps(drive))
-    path.with_suffix(".new").replace(path)
-    return drive
-
-
-def trial(seed: int, length_m: float) -> Drive:
-    """A drive of some metres with one seed; every tenth one also with all lamps covered."""
+def trial(task: tuple[int, float]) -> Drive:
+    """A drive with one seed, of some metres; every tenth one also with all lamps covered."""
+    seed, length_m = task
     run = room_drive(seed, length_m)
     seen, wheels, light = list(scans(run, ROOM_WALKERS)), list(run.odometry()), half(run.light())
     ways = {}

@@ -20,8 +20,8 @@ from daemon.config.schema import Config
 from estimator.paper import METHODS
 from tools.bench import crispness
 from tools.ci.figures import Figure
-from tools.experiments.report import COMMAND, Cell, Report, Table, Work
-from tools.experiments.trajectory import Errors, Track, errors, started
+from tools.experiments.support.report import COMMAND, Cell, Report, Table, Work
+from tools.experiments.support.trajectory import Errors, Track, errors, started
 from tools.relations import SPLIT_S, evaluate, read_relations
 from tools.sim import harness
 from tools.sim.building.buildings import building

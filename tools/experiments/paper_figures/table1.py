@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 
 from tools.ci.figures import bounded
-from tools.experiments.outings import outing
-from tools.experiments.report import COMMAND, Cell, Report, Table, Work
+from tools.experiments.support.outings import outing
+from tools.experiments.support.report import COMMAND, Cell, Report, Table, Work
 from tools.sim.building.buildings import building
 from tools.sim.ceiling.ceiling import Photodiode, paper_ceiling
 

@@ -24,7 +24,7 @@ from estimator.stored_map import image_of
 from tools.experiments.relocation.trial import Robot
 from tools.experiments.relocation.worlds import BODY, PERIOD_S, Place, Site, odometry
 from tools.sim.building.people import Crowd
-from tools.sim.robot import Drive
+from tools.sim.robot.drive import Drive
 
 LAPS: Final = 1
 

@@ -9,10 +9,9 @@ done with, so that a run that was broken off goes on where it was.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -25,7 +24,8 @@ from tools.ci.figures import Figure, bounded
 from tools.experiments.relocation.maps import kept_map
 from tools.experiments.relocation.trial import Case, Outcome, trial
 from tools.experiments.relocation.worlds import Place, Site, lit_house, symmetric_room
-from tools.experiments.report import COMMAND, Cell, Report, Table, Work, code
+from tools.experiments.support.proof import proved_share
+from tools.experiments.support.report import COMMAND, Cell, Report, Table, Work, code
 from tools.sim.ceiling.ceiling import Effects
 
 FOLDER: Final = Path("out/experiments/relocate")
@@ -94,36 +94,12 @@ def digest() -> str:
     return code(*SOURCES)
 
 
-def journal(name: str) -> Path:
-    """Where a setting's outcomes are kept."""
-    return FOLDER / f"{file_name(name)}-{digest()}.jsonl"
-
-
 def attempt(task: Task) -> Outcome:
-    """One trial, kept when it is done."""
+    """One trial."""
     site, lights = site_of(task.setting)
     carried, moving = bool(task.seed % 2), bool(task.seed // 2 % 2)
     case = Case(task.setting, carried, moving, SETTINGS[task.setting].seconds)
-    done = trial(site, image_of(task.setting), case, task.seed, lights)
-    keep(task.setting, done)
-    return done
-
-
-def keep(name: str, done: Outcome) -> None:
-    """Write an outcome down."""
-    with journal(name).open("a") as kept:
-        kept.write(json.dumps(asdict(done)) + "\n")
-
-
-def kept_outcomes(name: str) -> dict[int, Outcome]:
-    """Outcomes that are kept, by seed; a line cut short by a stop is left out."""
-    path, found = journal(name), {}
-    if path.exists():
-        for line in path.read_text().splitlines():
-            if line.endswith("}"):
-                one = Outcome(**json.loads(line))
-                found[one.seed] = one
-    return found
+    return trial(site, image_of(task.setting), case, task.seed, lights)
 
 
 def run(quick: bool, work: Work) -> Report:
@@ -133,11 +109,8 @@ def run(quick: bool, work: Work) -> Report:
     outcomes: dict[str, list[Outcome]] = {}
     for name, setting in SETTINGS.items():
         image_of(name)
-        kept = kept_outcomes(name)
-        seeds = range(max(2, round(setting.share * whole)))
-        fresh = work.map(attempt, [Task(name, seed) for seed in seeds if seed not in kept], name)
-        found = kept | {one.seed: one for one in fresh}
-        outcomes[name] = [found[seed] for seed in seeds]
+        tasks = [Task(name, seed) for seed in range(max(2, round(setting.share * whole)))]
+        outcomes[name] = work.map(attempt, tasks, name, FOLDER / digest())
     rows = [row for name, found in outcomes.items() for row in rows_of(name, found)]
     late = [late_row(name, one) for name, found in outcomes.items() for one in found if is_late(name, one)]
     tables = [Table("Where am I?", HEAD, tuple(rows))]
@@ -234,16 +207,6 @@ def figures_of(outcomes: dict[str, list[Outcome]]) -> list[Figure]:
         out.append(bounded(f"{name}: TRACKING wrongly, of {len(found)}", float(astray), "", "<= 0", command))
         far = sum(one.far_s > allowed(name) for one in found)
         out.append(bounded(f"{name}: off by > 1 m or 15 deg, of {len(found)}", float(far), "", "<= 0", command))
-        most = 100.0 * at_most(astray, len(found))
+        most = 100.0 * proved_share(astray, len(found))
         out.append(Figure(f"{name}: TRACKING wrongly, less than (95 %)", most, "%", command=command))
     return out
-
-
-def at_most(count: int, n: int, risk: float = 0.05) -> float:
-    """The largest share with which ``count`` of ``n`` or fewer still happen with that risk (Clopper and Pearson)."""
-    low, high = 0.0, 1.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        fewer = sum(math.comb(n, k) * middle**k * (1.0 - middle) ** (n - k) for k in range(count + 1))
-        low, high = (middle, high) if fewer > risk else (low, middle)
-    return high

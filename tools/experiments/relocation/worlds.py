@@ -18,13 +18,13 @@ import numpy as np
 from estimator.light_filter.survey import Survey
 from estimator.measurements import Beam, LightEpoch, Odometry, Scan
 from tools.sim.building.beams import UTM_30LX, Posture, Scanner, Sweep
-from tools.sim.building.buildings import Building
+from tools.sim.building.building import Building
 from tools.sim.building.people import Crowd, Walker
 from tools.sim.building.world import Array, Plan, Point
 from tools.sim.ceiling.ceiling import Ceiling, Effects
 from tools.sim.ceiling.lamps import Fixture, Zone, row, with_codes
 from tools.sim.ceiling.records import epochs, survey
-from tools.sim.robot import Body, Route
+from tools.sim.robot.drive import Body, Route
 
 DEPTH, CORRIDOR, LENGTH, HEIGHT = 6.0, 2.0, 24.0, 3.0
 SOUTH: Final = (0.0, 6.0, 12.0, 18.0, 24.0)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tools.sim.building.raycast import cast_scan
-from tools.sim.building.world import Array, World, material_table
+from tools.sim.building.world import Array, SimWorld, material_table
 
 KNOTS: Final = 17  # poses per scan between which the motion is taken as linear
 ECHOES: Final = 3
@@ -96,7 +96,7 @@ class Returns:
 class Scanner:
     """A lidar in a world. What it returns is a function of time, poses and seed: the same call gives the same scan."""
 
-    def __init__(self, world: World, sweep: Sweep, optics: Optics, seed: int = 0) -> None:
+    def __init__(self, world: SimWorld, sweep: Sweep, optics: Optics, seed: int = 0) -> None:
         self.sweep = sweep
         self.optics = optics
         self._seed = seed

@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
+from tools.sim.building.building import Building
+from tools.sim.building.office import office_floor
 from tools.sim.building.people import Walker
-from tools.sim.building.world import Plan, Point, World
-from tools.sim.robot import Route
+from tools.sim.building.world import Plan, Point
+from tools.sim.robot.drive import Route
 
 TURN_Y: Final = 46.9  # where the paper's robot turns round in the corridor: makes its tour 160 m
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Building:
-    """A world with its tour; ``height_m`` is the ceiling's."""
-
-    name: str
-    world: World
-    route: Route
-    people: tuple[Walker, ...] = ()
-    height_m: float = 3.0
 
 
 def paper_room(people: int = 2) -> Building:
@@ -163,17 +153,11 @@ def _upper_shelves(plan: Plan, y: float, seed: int) -> None:
                     )
 
 
-def _office(people: int = 6) -> Building:
-    from tools.sim.building.office import office_floor
-
-    return office_floor(people=people)
-
-
 BUILDINGS: Final[dict[str, Callable[[], Building]]] = {
     "paper_room": paper_room,
     "corridor_loop": corridor_loop,
     "warehouse_hall": warehouse_hall,
-    "office_floor": _office,
+    "office_floor": office_floor,
 }
 
 

@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from tools.sim.building.buildings import Building
+from tools.sim.building.building import Building
 from tools.sim.building.people import Walker
 from tools.sim.building.world import Array, Plan, Point
-from tools.sim.robot import Route
+from tools.sim.robot.drive import Route
 
 LENGTH: Final = 64.0
 ROOM_DEPTH: Final = 5.0

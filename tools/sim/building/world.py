@@ -57,7 +57,7 @@ def material_table() -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class World:
+class SimWorld:
     """The standing part of a building.
 
     Attributes:
@@ -114,7 +114,7 @@ def _segment_distance(points: Array, ends: tuple[float, float, float, float]) ->
 
 @dataclass(slots=True)
 class Plan:
-    """A drawing board: collects shapes, then :meth:`build` makes the indexed :class:`World`."""
+    """A drawing board: collects shapes, then :meth:`build` makes the indexed :class:`SimWorld`."""
 
     rows: list[tuple[float, float, float, float, float, float]] = field(default_factory=list)
     floors: list[tuple[float, float, float, float]] = field(default_factory=list)
@@ -162,7 +162,7 @@ class Plan:
         """Declare a rectangle of floor to be polished."""
         self.floors.append((x_min, y_min, x_max, y_max))
 
-    def build(self, margin: float = 2.0) -> World:
+    def build(self, margin: float = 2.0) -> SimWorld:
         """Index everything drawn so far; raises ValueError for an empty plan."""
         if not self.rows:
             raise ValueError("an empty plan has nothing to see; draw at least one line or circle")
@@ -175,7 +175,7 @@ class Plan:
         start, items = _fill_cells(shapes, frame)
         floors = np.array(self.floors, dtype=np.float64).reshape(-1, 4)
         shelves = np.array(self.shelves, dtype=np.float64).reshape(-1, 6)
-        return World(shapes, start, items, frame, floors, np.array(self.tops), shelves)
+        return SimWorld(shapes, start, items, frame, floors, np.array(self.tops), shelves)
 
 
 def _extent(shapes: Array) -> tuple[float, float, float, float]:

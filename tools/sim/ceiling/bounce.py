@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from tools.sim.building.world import CIRCLE, SEGMENT, World, material_table
+from tools.sim.building.world import CIRCLE, SEGMENT, SimWorld, material_table
 from tools.sim.ceiling.kernels import COLUMN_COLUMNS, exchange, gather, light_up, see_columns
 from tools.sim.ceiling.lamps import Zone
 
@@ -48,7 +48,7 @@ class Finish:
 class Walls:
     """The walls of one zone as patches, and places on a grid in it; the zone's lamps share it."""
 
-    def __init__(self, world: World, zone: Zone, finish: Finish) -> None:
+    def __init__(self, world: SimWorld, zone: Zone, finish: Finish) -> None:
         self.zone, self.finish = zone, finish
         x_min, y_min, x_max, y_max = zone
         nx, ny = (max(int(np.ceil((b - a) / finish.pitch)), 1) for a, b in ((x_min, x_max), (y_min, y_max)))
@@ -103,7 +103,7 @@ def inside(shapes: Array, zone: Zone, margin: float) -> npt.NDArray[np.bool_]:
     return np.asarray((x[0] <= x_max) & (x[1] >= x_min) & (y[0] <= y_max) & (y[1] >= y_min))
 
 
-def _standing(world: World, zone: Zone) -> Array:
+def _standing(world: SimWorld, zone: Zone) -> Array:
     """Obstacle rows of what reaches the ceiling in and around a zone; panes let light through."""
     tall = np.isinf(world.tops) & inside(world.shapes, zone, 0.05)
     return obstacle_rows(world.shapes[tall], world.tops[tall])
@@ -115,7 +115,7 @@ def obstacle_rows(shapes: Array, tops: Array) -> Array:
     return np.column_stack([shapes[:, :5], np.zeros(len(shapes)), tops, clear])
 
 
-def _patches(world: World, zone: Zone, finish: Finish) -> tuple[Array, Array, float]:
+def _patches(world: SimWorld, zone: Zone, finish: Finish) -> tuple[Array, Array, float]:
     """Columns of the zone's walls, heights of the patches' middles, and a patch's height."""
     x_min, y_min, x_max, y_max = zone
     shapes, tops = world.shapes, world.tops

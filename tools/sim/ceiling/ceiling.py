@@ -19,8 +19,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from tools.sim.building.buildings import Building, building
-from tools.sim.building.world import World
+from tools.sim.building.building import Building
+from tools.sim.building.buildings import building
+from tools.sim.building.world import SimWorld
 from tools.sim.ceiling import optics
 from tools.sim.ceiling.bounce import Finish, Walls, inside, interpolate, obstacle_rows
 from tools.sim.ceiling.diffuse import carried, own_wave, pattern, waves, within
@@ -52,7 +53,7 @@ class Ceiling:
     """
 
     fixtures: tuple[Fixture, ...]
-    world: World
+    world: SimWorld
     height_m: float = 3.0
     effects: Effects = field(default_factory=Effects)
     photodiode: Photodiode = field(default_factory=Photodiode)

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from tools.sim.building.buildings import Building
+from tools.sim.building.building import Building
 
 CODES: Final = 129
 Zone = tuple[float, float, float, float]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tools.sim.building.people import Crowd, Walker
-from tools.sim.robot import Drive, leans
+from tools.sim.robot.drive import Drive, leans
 
 Array = npt.NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from typing import Any, Final
 import numpy as np
 
 from tools.sim.building.buildings import building
+from tools.sim.building.draw import asked, draw_building
 from tools.sim.ceiling.ceiling import IDEAL, Array, Ceiling, ceiling_of
 from tools.sim.ceiling.diffuse import within
 from tools.sim.ceiling.lamps import Zone
-from tools.sim.draw import asked, draw_building
 
 PIXELS: Final = 160
 """Along the longer side."""

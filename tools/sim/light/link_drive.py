@@ -18,15 +18,16 @@ import numpy as np
 
 from estimator.light_filter.survey import Survey
 from estimator.measurements import LightEpoch, Odometry
-from tools.sim.building.buildings import Building, building
+from tools.sim.building.building import Building
+from tools.sim.building.buildings import building
 from tools.sim.building.people import Walker
-from tools.sim.building.world import World
+from tools.sim.building.world import SimWorld
 from tools.sim.ceiling.ceiling import Array, Ceiling, Effects, ceiling_of, paper_ceiling
 from tools.sim.ceiling.links import Reception
 from tools.sim.ceiling.movers import lean_of, walkers_of
 from tools.sim.ceiling.records import epochs, survey
-from tools.sim.odometry import Odometer, Wheels
-from tools.sim.robot import Body, Drive, Route
+from tools.sim.robot.drive import Body, Drive, Route
+from tools.sim.robot.odometry import Odometer, Wheels
 
 ROOM_ROUTE: Final = Route(
     (
@@ -59,7 +60,7 @@ class LightRun:
     ceiling: Ceiling
     survey: Survey
     wheels: Wheels
-    world: World
+    world: SimWorld
     seed: int
     seconds: float
     reception: Reception
@@ -92,7 +93,7 @@ class LightRun:
         return dead_reckoning(self.drive, self.world, self.wheels, self.seed, self.seconds)
 
 
-def dead_reckoning(drive: Drive, world: World, wheels: Wheels, seed: int, seconds: float) -> Array:
+def dead_reckoning(drive: Drive, world: SimWorld, wheels: Wheels, seed: int, seconds: float) -> Array:
     """(n, 3) poses from the true start on odometry alone, one a reading."""
     odometer = Odometer(drive, world, wheels, seed)
     read = np.array([odometer.reading(k) for k in range(int(seconds * wheels.rate_hz) + 1)])
@@ -101,7 +102,7 @@ def dead_reckoning(drive: Drive, world: World, wheels: Wheels, seed: int, second
     return np.column_stack([x + c * read[:, 0] - s * read[:, 1], y + s * read[:, 0] + c * read[:, 1], yaw + read[:, 2]])
 
 
-def sized_wheels(drive: Drive, world: World, seed: int, off_m: float, wheels: Wheels | None = None) -> Wheels:
+def sized_wheels(drive: Drive, world: SimWorld, seed: int, off_m: float, wheels: Wheels | None = None) -> Wheels:
     """Wheels of which dead reckoning ends about ``off_m`` off after the drive: the seed's errors, scaled together."""
     wheels, size = wheels or Wheels(), 0.3
     end = drive.pose(np.array([drive.lap_s]))[0, :2]

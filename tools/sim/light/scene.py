@@ -9,7 +9,7 @@ import numpy as np
 
 from estimator.cdma.epoch import LightEpoch
 from estimator.light_filter.survey import Survey
-from tools.sim.building.buildings import Building
+from tools.sim.building.building import Building
 from tools.sim.building.people import Crowd
 from tools.sim.ceiling.ceiling import Array, Ceiling, Effects, Photodiode
 from tools.sim.ceiling.lamps import fixtures
@@ -19,7 +19,7 @@ from tools.sim.ceiling.records import frames, light_epoch
 from tools.sim.ceiling.records import survey as survey_of
 from tools.sim.light.stream import LightStream
 from tools.sim.light.waveform import Ambient, Receiver
-from tools.sim.robot import Drive, leans
+from tools.sim.robot.drive import Drive, leans
 
 WAVEFORM: Final = "waveform"
 """Samples of a converter, to be decoded."""

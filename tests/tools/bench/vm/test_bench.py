@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tools.bench.report import Seen
+from tools.bench.report.result import Seen
 from tools.bench.vm import bench, common, image, places, trying_system, world
 from tools.bench.vm.bench import Bench, Ears, Heard
 from tools.bench.vm.guests import tried

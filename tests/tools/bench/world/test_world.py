@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.bench.report import Seen
+from tools.bench.report.result import Seen
 from tools.bench.world import agreement
 from tools.bench.world.__main__ import twins
 from tools.bench.world.judge import Played, Read, errors_of, judged, pictures

@@ -13,7 +13,7 @@ from tools.experiments.integrity import campaign
 from tools.experiments.integrity.report import COLUMNS, Array, judged, report
 from tools.experiments.integrity.run import run
 from tools.experiments.integrity.scene import draw
-from tools.experiments.report import draw as draw_pictures
+from tools.experiments.support.report import draw as draw_pictures
 
 AT = {name: number for number, name in enumerate(COLUMNS)}
 
@@ -141,7 +141,7 @@ def test_a_short_drive_tracks_and_is_kept(tmp_path: Path) -> None:
         )
     assert campaign.missing(["clean_unlit"], range(2), tmp_path) == []
     found = report(tmp_path, ["clean_unlit"])
-    assert "wrong: 0 of 2: at most 77.64% of scenarios like these (95 %)" in found.text()
+    assert "wrong: 0 of 2: at most 77.64% of scenarios like these (95 %)" in "\n".join(found.figures())
     told = campaign.told(found, range(2))
     assert (told.figures[0].value, told.figures[0].ok) == (0.0, True)
     (picture,) = draw_pictures(told, tmp_path)

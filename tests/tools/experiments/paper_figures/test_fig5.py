@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from tools.experiments import outings
-from tools.experiments.trajectory import Track, errors, started
+from tools.experiments.support import outings
+from tools.experiments.support.trajectory import Track, errors, started
 
 
 def circle(n: int = 100) -> np.ndarray:

@@ -12,10 +12,10 @@ from estimator.mapping.keyframe import keep
 from estimator.measurements import Beam, Scan
 from estimator.numerics import se2
 from tools.experiments import islands
-from tools.experiments.loop_drives import room_drive
 from tools.experiments.paper_figures.fig6_curves import Point, best, counted, right
-from tools.experiments.paper_figures.fig6_trial import Detection, stored
+from tools.experiments.paper_figures.fig6_trial import Detection, trial
 from tools.experiments.paper_figures.fig6_truth import Truth
+from tools.experiments.support.loop_drives import room_drive
 
 GOOD = Detection(1, 1, False, 0.9, 0.0, 0.007, True, 1.0, 1.0, 0.01, 0.001, True, (0.0, 0.0, 0.0))
 MIRROR = replace(GOOD, off_m=8.5, off_rad=math.pi, positive=False, light=9000.0, place=(8.0, 0.0, 3.0))
@@ -63,7 +63,7 @@ def test_precision_and_recall() -> None:
 
 @pytest.mark.slow
 def test_a_short_drive_closes_right_loops_only() -> None:
-    short = stored((1, 40.0, None))
+    short = trial((1, 40.0))
     for way in short.ways.values():
         assert way.loops
         assert all(right(one) or one.off_m < 0.05 for one in way.loops)

@@ -8,7 +8,7 @@ import pytest
 
 from estimator.paper import METHODS
 from tools.experiments.paper_figures import methods
-from tools.experiments.report import Work, save
+from tools.experiments.support.report import Work, save
 
 
 def test_the_first_number_of_a_row_stands_for_it() -> None:

@@ -7,8 +7,8 @@ import pytest
 
 from tools.sim.building.beams import IDEAL, Optics, Poses, Posture, Returns, Scanner, Sweep
 from tools.sim.building.buildings import BUILDINGS, building
-from tools.sim.building.world import CIRCLE, MATERIAL_ID, Array, Plan, World
-from tools.sim.robot import Body, Drive
+from tools.sim.building.world import CIRCLE, MATERIAL_ID, Array, Plan, SimWorld
+from tools.sim.robot.drive import Body, Drive
 
 NOBODY = np.zeros((0, 7))
 ALL_ROUND = Sweep(np.radians(np.arange(-540, 541) * 0.25), 0.0, 0.01875)
@@ -18,7 +18,7 @@ def standing(x: float, y: float, yaw: float) -> Poses:
     return lambda t: np.tile([float(x), float(y), float(yaw)], (len(t), 1))
 
 
-def look(world: World, pose: tuple[float, float, float], optics: Optics = IDEAL, **kw: object) -> Returns:
+def look(world: SimWorld, pose: tuple[float, float, float], optics: Optics = IDEAL, **kw: object) -> Returns:
     scanner = Scanner(world, kw.pop("sweep", ALL_ROUND), optics, 3)  # type: ignore[arg-type]  # test shorthand
     return scanner.measure(0.0, standing(*pose), kw.pop("movers", NOBODY), kw.pop("posture", Posture(0.3)))  # type: ignore[arg-type]  # test shorthand
 
@@ -65,7 +65,7 @@ def test_cells_miss_nothing(name: str) -> None:
     place = building(name)
     shapes = place.world.shapes.copy()
     shapes[:, 5] = MATERIAL_ID["wall"]
-    world = World(shapes, place.world.cell_start, place.world.cell_items, place.world.frame, place.world.polished)
+    world = SimWorld(shapes, place.world.cell_start, place.world.cell_items, place.world.frame, place.world.polished)
     drive = Drive(place.route, Body())
     few = Sweep(np.radians(np.linspace(-180, 180, 23)[:-1] + 0.37), 0.0, 0.01)
     for pose in drive.pose(np.linspace(3.0, drive.lap_s, 6)):

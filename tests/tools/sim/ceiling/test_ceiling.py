@@ -12,7 +12,7 @@ from tools.sim.building.world import Plan
 from tools.sim.ceiling import optics
 from tools.sim.ceiling.ceiling import IDEAL, Ceiling, paper_ceiling
 from tools.sim.ceiling.lamps import Fixture
-from tools.sim.robot import Route
+from tools.sim.robot.drive import Route
 
 ROOM = (-5.0, -5.0, 5.0, 5.0)
 

@@ -1,0 +1,19 @@
+"""``lumiloop convert``: recorded lidar data of other formats, turned into a log that `lumiloop replay` reads."""
+
+from __future__ import annotations
+
+import argparse
+
+from daemon.replay import convert
+from daemon.system import console
+
+
+def main(args: argparse.Namespace) -> int:
+    """The command ``convert``; returns the exit code."""
+    delay = convert.DELAY_S if args.delay is None else args.delay
+    try:
+        scans = convert.convert(args.source, args.log, args.logged, delay, args.all)
+    except convert.NotConverted as error:
+        return console.fail(str(error))
+    console.say(f"{len(scans.stamps)} scans of {scans.ranges.shape[1]} beams into {args.log}")
+    return console.OK

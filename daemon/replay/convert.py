@@ -1,0 +1,240 @@
+"""Recorded lidar data of other formats as CARMEN logs that `lumiloop replay` reads.
+
+The input is recognised by its content:
+
+* the ``.dat`` files of CoreSLAM/BreezySLAM (``.gz`` too): a HOKUYO URG-04LX on a rover with wheel encoders, one scan a
+  line: [0] time in us, [2] [3] encoder counts left and right, [24..705] 682 ranges in mm from step 44 to 725, 0 where
+  there was no return;
+* an ``.npz`` with ``t_device_s``, ``range_mm``, ``angle_min_rad``, ``angle_increment_rad``, ``time_increment_s``: scans
+  of a HOKUYO UTM-30LX.
+
+The log gets ROBOTLASER1 lines with start angle, field of view and resolution, and PARAM lines for what such a line
+cannot say: the mount, the model, its ranges, the time of a revolution and between beams.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+GZIP_MAGIC: Final = b"\x1f\x8b"
+URG_STEP_RAD: Final = 2.0 * math.pi / 1024.0
+URG_FIRST_STEP, URG_FRONT_STEP = 44, 384
+URG_BEAMS, URG_FIELDS, URG_RANGES_AT = 682, 707, 24
+URG_PERIOD_S: Final = 0.1
+ROVER_COUNT_M: Final = 2.0 * math.pi * 0.077 / 2000.0
+ROVER_HALF_TRACK_M: Final = 0.165
+ROVER_MOUNT: Final = (0.145, 0.0, 0.0)
+ROVER_HIDDEN_BEAMS: Final = 70
+ROVER_TRUSTED_MM: Final = 4000
+UTM_STEPS: Final = 1440
+DELAY_S: Final = 0.12
+"""First beam to arrival: where wheels and scans of exp1 and exp2 agree best about every turn (0.66 and 0.74 deg RMS
+against 1.70 and 1.82 with the host's stamps)."""
+MOTOR_TOLERANCE: Final = 0.03
+PERIODS_TRIED: Final = 6001
+
+
+class NotConverted(Exception):
+    """The input cannot be converted; the text names the file, the place, and what is expected."""
+
+
+@dataclass(frozen=True)
+class Laser:
+    """What the log says about its laser: angles in rad, ranges in mm, times in s."""
+
+    model: str
+    start: float
+    step: float
+    dmin: int
+    dmax: int
+    period: float
+    beam_dt: float
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Stamps (n,) in s, ranges (n, beams) in mm, poses (n, 3) of the robot by its wheels."""
+
+    laser: Laser
+    stamps: Array
+    ranges: npt.NDArray[np.int64]
+    poses: Array
+
+
+def read(path: Path) -> Scans:
+    """Read any of the known formats; raises `NotConverted`."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(4)
+    except OSError as error:
+        raise NotConverted(f"{path}: {error.strerror}") from error
+    if not begin:
+        raise NotConverted(f"{path}: the file is empty")
+    return read_npz(path) if begin.startswith(b"PK\x03\x04") else read_dat(path)
+
+
+def read_dat(path: Path) -> Scans:
+    """A ``.dat`` file as logged: every range, stamps of the host, wheel poses at those stamps."""
+    rows = np.array(list(_fields(path)))
+    laser = Laser(
+        model="URG-04LX",
+        start=(URG_FIRST_STEP - URG_FRONT_STEP) * URG_STEP_RAD,
+        step=URG_STEP_RAD,
+        dmin=20,
+        dmax=5600,
+        period=URG_PERIOD_S,
+        beam_dt=URG_PERIOD_S / 1024.0,
+        mount=ROVER_MOUNT,
+    )
+    ranges = rows[:, URG_RANGES_AT : URG_RANGES_AT + URG_BEAMS].astype(np.int64)
+    return Scans(laser, 1e-6 * rows[:, 0], ranges, wheel_poses(rows[:, 2:4]))
+
+
+def _fields(path: Path) -> Iterator[list[float]]:
+    try:
+        data = path.read_bytes()
+        text = gzip.decompress(data) if data.startswith(GZIP_MAGIC) else data
+    except (EOFError, zlib.error, OSError) as error:
+        raise NotConverted(f"{path}: {error}") from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if len(words) != URG_FIELDS:
+            raise NotConverted(f"{path}:{number}: {len(words)} fields; a scan of this format has {URG_FIELDS}")
+        try:
+            yield list(map(float, words))
+        except ValueError as error:
+            raise NotConverted(f"{path}:{number}: {error}") from error
+
+
+def wheel_poses(counts: Array) -> Array:
+    """(n, 3) poses of the middle of the axle from (n, 2) cumulative counts left and right; arcs, not chords."""
+    left, right = np.diff(counts * ROVER_COUNT_M, axis=0, prepend=counts[:1] * ROVER_COUNT_M).T
+    way, turn = (left + right) / 2.0, (right - left) / (2.0 * ROVER_HALF_TRACK_M)
+    yaw = np.cumsum(turn)
+    middle = yaw - turn / 2.0
+    chord = way * np.sinc(turn / (2.0 * np.pi))
+    return np.column_stack([np.cumsum(chord * np.cos(middle)), np.cumsum(chord * np.sin(middle)), yaw])
+
+
+def read_npz(path: Path) -> Scans:
+    """An ``.npz`` file of UTM-30LX scans; there are no wheels in it."""
+    names = ("t_device_s", "range_mm", "angle_min_rad", "angle_increment_rad", "time_increment_s")
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            stamps, ranges, start, step, beam_dt = (np.asarray(data[name]) for name in names)
+    except (KeyError, ValueError, zipfile.BadZipFile, OSError) as error:
+        raise NotConverted(f"{path}: {error}; expected the arrays {', '.join(names)}") from error
+    if ranges.ndim != 2 or stamps.shape != ranges.shape[:1]:
+        raise NotConverted(f"{path}: {stamps.shape} stamps for ranges of shape {ranges.shape}")
+    laser = Laser("UTM-30LX", float(start), float(step), 23, 60_000, UTM_STEPS * float(beam_dt), float(beam_dt))
+    return Scans(laser, stamps.astype(np.float64), ranges.astype(np.int64), np.zeros((len(stamps), 3)))
+
+
+def even_stamps(scans: Scans, delay: float) -> Scans:
+    """Put each scan at its own turn of the motor instead of at its arrival, and the wheels' pose at that instant.
+
+    The motor turns evenly, the host does not listen evenly: an arrival tells which turn it was, all of them together
+    tell when the turns were. ``delay`` is from the first beam of a scan to its mean arrival, s.
+    """
+    period, first = _rhythm(scans.stamps)
+    turns = _turns((scans.stamps - first) / period)
+    late = scans.stamps - first - turns * period
+    first += float(np.median(late)) - delay
+    stamps = first + turns * period
+    poses = np.column_stack([np.interp(stamps, scans.stamps, column) for column in scans.poses.T])
+    laser = replace(scans.laser, period=period, beam_dt=period / 1024.0)
+    return replace(scans, stamps=stamps, poses=poses, laser=laser)
+
+
+def _rhythm(stamps: Array) -> tuple[float, float]:
+    """Period and an instant of the regular grid that the arrivals lie closest to (the peak of their periodogram)."""
+    usual = float(np.median(np.diff(stamps)))
+    late = stamps - stamps[0]
+    periods = usual * np.linspace(1.0 - MOTOR_TOLERANCE, 1.0 + MOTOR_TOLERANCE, PERIODS_TRIED)
+    peaks = np.array([np.exp(2j * np.pi * late / period).mean() for period in periods])
+    best = int(np.abs(peaks).argmax())
+    return float(periods[best]), float(stamps[0] + np.angle(peaks[best]) / (2.0 * np.pi) * periods[best])
+
+
+def _turns(late: Array) -> Array:
+    """Whole, rising turns nearest to ``late``; of a burst of arrivals, those before the last are the late ones."""
+    turns = np.rint(late)
+    for k in range(len(turns) - 2, -1, -1):
+        turns[k] = min(turns[k], turns[k + 1] - 1.0)
+    return np.asarray(turns)
+
+
+def trusted(scans: Scans, hidden: int, farthest: int) -> Scans:
+    """Without ``hidden`` beams at either end (the rover itself) and without ranges beyond ``farthest`` mm."""
+    ranges = scans.ranges.copy()
+    ranges[:, :hidden] = 0
+    ranges[:, ranges.shape[1] - hidden :] = 0
+    ranges[ranges > farthest] = 0
+    return replace(scans, ranges=ranges)
+
+
+def write(path: Path, scans: Scans, source: str) -> None:
+    """Write the log, gzipped if the name says so; raises `NotConverted`."""
+    text = ("\n".join(_lines(scans, source)) + "\n").encode()
+    try:
+        path.write_bytes(gzip.compress(text, 5, mtime=0) if path.suffix == ".gz" else text)
+    except OSError as error:
+        raise NotConverted(f"{path}: {error.strerror}") from error
+
+
+def _lines(scans: Scans, source: str) -> Iterator[str]:
+    laser, count = scans.laser, scans.ranges.shape[1]
+    first = f"{scans.stamps[0]:.6f} convert 0"
+    yield f"# made from {source} by lumiloop convert; see docs/data.md"
+    yield from (f"PARAM {name} {value} {first}" for name, value in _parameters(laser).items())
+    setup = f"0 {laser.start:.9f} {laser.step * (count - 1):.9f} {laser.step:.12f} {(laser.dmax + 1) / 1e3:.3f} 0.001 0"
+    mount = laser.mount
+    for stamp, ranges, pose in zip(scans.stamps.tolist(), scans.ranges.tolist(), scans.poses.tolist(), strict=True):
+        values = " ".join(f"{value / 1e3:.3f}" for value in ranges)
+        robot = " ".join(f"{value:.9f}" for value in pose)
+        yaw = pose[2]
+        x = pose[0] + math.cos(yaw) * mount[0] - math.sin(yaw) * mount[1]
+        y = pose[1] + math.sin(yaw) * mount[0] + math.cos(yaw) * mount[1]
+        seen = f"{x:.9f} {y:.9f} {yaw + mount[2]:.9f}"
+        tail = f"0 0 0 0 0 {stamp:.6f} convert {stamp - scans.stamps[0]:.6f}"
+        yield f"ROBOTLASER1 {setup} {count} {values} 0 {seen} {robot} {tail}"
+
+
+def _parameters(laser: Laser) -> dict[str, str]:
+    """CARMEN's own parameters where it has them, ours for the rest (`hal.replay.carmen_scans`)."""
+    x, y, yaw = laser.mount
+    return {
+        "robot_frontlaser_offset": f"{x:.6f}",
+        "robot_frontlaser_side_offset": f"{y:.6f}",
+        "robot_frontlaser_angular_offset": f"{yaw:.6f}",
+        "lumiloop_laser_model": laser.model,
+        "lumiloop_laser_dmin": f"{laser.dmin / 1e3:.3f}",
+        "lumiloop_laser_period": f"{laser.period:.9f}",
+        "lumiloop_laser_beam_dt": f"{laser.beam_dt:.12f}",
+    }
+
+
+def convert(source: Path, log: Path, logged: bool = False, delay: float = DELAY_S, every: bool = False) -> Scans:
+    """Convert a file to a CARMEN log and return what was written; raises `NotConverted`.
+
+    Of a rover's log the scans get even stamps, unless ``logged``, and lose beams that see the rover, unless ``every``.
+    """
+    scans = read(source)
+    if scans.laser.model == "URG-04LX":
+        scans = scans if logged else even_stamps(scans, delay)
+        scans = scans if every else trusted(scans, ROVER_HIDDEN_BEAMS, ROVER_TRUSTED_MM)
+    write(log, scans, source.name)
+    return scans

@@ -1,0 +1,1 @@
+"""Reports of runs on a bench: results, pictures, pages, and the comparison with another run."""

@@ -1,8 +1,0 @@
-"""``python -m tools.experiments.integrity``."""
-
-import sys
-
-from tools.experiments.integrity.campaign import main
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Experiments on recordings of others: a testbed of visible light positioning."""
