@@ -232,7 +232,7 @@ async def test_what_cannot_be_shown_ends_nothing(tmp_path: Path, monkeypatch: py
 
     async with serving(tmp_path) as house, house.page() as page:
         await page.welcome()
-        monkeypatch.setattr(house.view.hub, "take", lambda data: 1 / 0)
+        monkeypatch.setattr(house.view.hub, "distribute", lambda data: 1 / 0)
         house.stream.publish(snapshot(1))
         await page.until("daemon", lambda told: "could not be shown" in told["why"])
         monkeypatch.undo()
