@@ -45,7 +45,7 @@ ORDER = {
         *("stream", "access_guard", "command_client", "zenoh_session", "ros", "foxglove", "mcap", "view", "metrics"),
         "fleet",
     ),
-    "tools": ("ci", "clients", "sim", "convert", "relations", "demo", "bench", "experiments", "soak", "docs"),
+    "tools": ("ci", "clients", "sim", "relations", "demo", "bench", "experiments", "soak", "docs"),
 }
 """The entries of each room in order. A module imports from its own entry and from those to its left.
 
