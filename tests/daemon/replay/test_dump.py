@@ -43,8 +43,8 @@ def let_write(seconds: float) -> None:
     time.sleep(seconds)
 
 
-def replayed(folder: Path, out: Path) -> dict[str, dict[str, Any]]:
-    assert parser.main(["replay", str(folder), "--out", str(out)]) == console.OK
+def replayed(folder: Path, out: Path, *options: str) -> dict[str, dict[str, Any]]:
+    assert parser.main(["replay", str(folder), "--out", str(out), *options]) == console.OK
     summary: dict[str, dict[str, Any]] = json.loads((out / "summary.json").read_text())
     return summary
 
@@ -125,6 +125,12 @@ def test_a_ring_holds_the_latest_and_a_dump_of_it_is_a_beginning(tmp_path: Path)
         said = replayed(folder, tmp_path / f"out-{folder.name}")
         assert said["recorded_run"]["differ"] == 0, said["recorded_run"]
         assert 30 <= said["recorded_run"]["cycles"] < 100
+    for method in ("paper", "pic"):  # neither goes on in the state of the daemon's own
+        other = replayed(dumps[0], tmp_path / method, "--method", method)
+        assert other["recorded_run"] is None
+        notes = other["log"]["report"]["notes"]
+        assert any(note.startswith(f"method {method} begins with an empty map") for note in notes)
+        assert other["counts"]["matched"] > 20
 
 
 async def unplugged(bench: Bench) -> None:
