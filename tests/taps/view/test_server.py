@@ -263,7 +263,7 @@ def test_what_cannot_be_shown_ends_nothing(tmp_path: Path, monkeypatch: pytest.M
     async def body(house: House) -> None:
         async with house.page() as page:
             await page.welcome()
-            monkeypatch.setattr(house.view.hub, "take", lambda data: 1 / 0)
+            monkeypatch.setattr(house.view.hub, "distribute", lambda data: 1 / 0)
             house.stream.publish(snapshot(1))
             await page.until("daemon", lambda told: "could not be shown" in told["why"])
             monkeypatch.undo()
