@@ -1,4 +1,4 @@
-"""ReplySource address of a UDP reply: the address that the request was sent to (ip(7), IP_PKTINFO; RFC 3542, 6.1, 6.2).
+"""Source address of a UDP reply: the address that the request was sent to (ip(7), IP_PKTINFO; RFC 3542, 6.1, 6.2).
 
 A client with a connected socket accepts replies from that address only, while the kernel would choose one by the route.
 Only a socket bound to all addresses of this computer needs this.

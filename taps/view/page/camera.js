@@ -1,4 +1,4 @@
-// Where one looks: metres of the map to pixels, and the hands that move it.
+// The view of the map: metres to pixels, and its control by mouse, touch and keys.
 
 const NEAREST = 600, FARTHEST = 2, INNER = 0.32;
 
@@ -9,10 +9,10 @@ export class Camera {
     this.x = this.y = 0;
     this.scale = 48;         // pixels a metre
     this.follow = true;
-    this.fitted = false;     // nobody has chosen a view yet
+    this.fitted = false;     // the user has not chosen a view yet
     this.width = this.height = 1;
     this.fingers = new Map();
-    this.aim = null;         // {from, to}: a pose that is being dragged; null: hands move the map
+    this.aim = null;         // {from, to}: a pose that is being dragged; null: dragging moves the map
     this.aiming = false;
     this.listen();
   }
@@ -46,7 +46,7 @@ export class Camera {
     this.changed();
   }
 
-  // Keep a place in the inner part of the view.
+  // Keep a point in the inner part of the view.
   keep(x, y) {
     if (!this.follow || this.fingers.size) return;
     const [left, top] = this.screen(x, y), w = INNER * this.width, h = INNER * this.height;

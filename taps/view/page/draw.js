@@ -1,4 +1,4 @@
-// Draws the world: the map beneath, and above it what moves.
+// Draws the map and, above it, robot, scan, lamps and loops.
 
 const FULL_TURN = 2 * Math.PI, ELLIPSE = 2.448, PULSE_MS = 2500;   // 2.448 deviations hold 95 % in a plane
 const STATES = ["none", "bad", "teal", "good", "warn", "seek", "bad", "seek"];

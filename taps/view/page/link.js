@@ -1,4 +1,4 @@
-// The WebSocket: opens it, opens it again when it is lost, tells what comes, and knows the server's clock.
+// The WebSocket: connects, reconnects, delivers messages, and estimates the offset of the server's clock.
 
 import { decode } from "./msgpack.js";
 
@@ -6,20 +6,20 @@ export const PROTOCOL = 1;
 const PING_MS = 5000, UNANSWERED = 2, LAST_RETRY_MS = 5000, RELOAD_MS = 2000, TOKEN = "lumiloop-token", RELOADED = "lumiloop-reloaded";
 
 export class Link {
-  // told: {welcome, refused, frame, lost}: what is called with what comes.
+  // told: callbacks {welcome, refused, frame, lost}.
   constructor(told) {
     this.told = told;
     this.page = document.querySelector("meta[name=lumiloop-page]").content;
     this.offset = 0;        // server's clock less ours, s
-    this.trip = Infinity;   // of the ping that said so
-    this.heard = -Infinity; // when the server said anything last, ms of this page
+    this.trip = Infinity;   // round trip of the ping behind the offset, ms
+    this.heard = -Infinity; // time of the server's last message, ms of this page
     this.retry = 250;
     this.token = token();
     addEventListener("visibilitychange", () => { if (!document.hidden && !this.socket) this.open(); });
     addEventListener("hashchange", () => {
       this.token = token();
       if (this.socket) this.socket.close();
-      else this.open();   // it was refused for want of the right one
+      else this.open();   // it was refused without the right token
     });
   }
 
@@ -34,7 +34,7 @@ export class Link {
     socket.onmessage = (event) => { this.heard = performance.now(); this.take(event.data); };
     socket.onclose = () => this.closed();
     this.unanswered = 0;
-    this.beat = setInterval(() => this.ping(), PING_MS);   // also while it is being opened, which may take minutes
+    this.beat = setInterval(() => this.ping(), PING_MS);   // also while connecting, which may take minutes
   }
 
   closed() {
@@ -45,7 +45,7 @@ export class Link {
     this.retry = Math.min(2 * this.retry, LAST_RETRY_MS);
   }
 
-  // Whether it went out: there may be no connection just now.
+  // Returns whether the message was sent: there may be no connection.
   say(words) {
     if (!this.socket || this.socket.readyState !== WebSocket.OPEN) return false;
     this.socket.send(JSON.stringify(words));
@@ -95,7 +95,7 @@ export class Link {
     this.told.welcome(words);
   }
 
-  // This page is of another version than the server: say so, and load the right one; once only for each.
+  // The page's version differs from the server's: show a notice and reload, once for each version.
   old(page) {
     this.refused = true;
     const again = sessionStorage.getItem(RELOADED) !== page;
@@ -106,7 +106,7 @@ export class Link {
     else this.socket.close();
   }
 
-  // A network that has gone closes no socket for minutes: without answers it is given up and opened again.
+  // A lost network does not close the socket for minutes: without answers, reconnect.
   ping() {
     if (this.unanswered >= UNANSWERED) {
       const socket = this.socket;
@@ -125,11 +125,11 @@ export class Link {
     if (trip > this.trip * 1.5 + 2) return;
     this.trip = Math.min(trip, this.trip);
     const offset = words.utc - (performance.timeOrigin + performance.now() - trip / 2) / 1000;
-    this.offset = Math.abs(offset) < trip / 2000 ? 0 : offset;   // no farther apart than can be told: the same clock
+    this.offset = Math.abs(offset) < trip / 2000 ? 0 : offset;   // within the resolution: the same clock
   }
 }
 
-// The token out of the address, which then shows it no more, or as it was known before in this tab.
+// Take the token from the URL and remove it there, or from this tab's storage.
 function token() {
   const told = new URLSearchParams(location.hash.slice(1)).get("token");
   if (told) {

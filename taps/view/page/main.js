@@ -1,4 +1,4 @@
-// Ties the page together: what comes goes to the world, and the world is drawn when it has changed.
+// Connects the parts of the page: messages update the world, and a changed world is drawn.
 
 import { Camera } from "./camera.js";
 import { Painter } from "./draw.js";
@@ -19,8 +19,8 @@ const painter = new Painter($("base"), $("over"), world, camera);
 const panel = new Panel(world);
 const plots = new Plots(world, $("plots"));
 let baseDirty = true, scheduled = false, gone = "", wordsAt = 0, plotsAt = 0, session = 0, recording = null, poseAt = 0, old = false;
-const late = [];          // ms from the scan to the screen, the latest ones
-let unshown = null;       // the pose that is drawn next
+const late = [];          // latest delays from scan to screen, ms
+let unshown = null;       // the pose of the next drawing
 
 const link = new Link({
   welcome(words) {
@@ -66,7 +66,7 @@ function daemon(data) {
   banner(data.up ? "" : `No daemon: ${data.why}`);
 }
 
-// Refused for want of a token: nothing is tried again until there is one.
+// Refused without a token: no reconnect until there is one.
 function barred() { return link.refused === "token"; }
 
 function banner(told) {
@@ -114,7 +114,7 @@ function fit() {
   camera.fit(all);
 }
 
-// How long ago the scan was that is now on the screen.
+// Age of the scan on the screen.
 function measure() {
   if (!recording) {
     late.push(1000 * (link.now() - (unshown.t_utc - unshown.t_sent + unshown.t_mono)));
@@ -123,7 +123,7 @@ function measure() {
   unshown = null;
 }
 
-// A daemon that is there and says nothing; where the server is silent, too, nobody knows.
+// A connected daemon without messages; unknown while the server is silent, too.
 function stale() {
   const now = poseAt > 0 && !recording && !gone && performance.now() - poseAt > OLD_MS;
   const who = link.heard - poseAt > OLD_MS ? ": the daemon stands" : "";
@@ -199,4 +199,4 @@ setInterval(schedule, 1000);
 theme(chosen());
 link.open();
 
-globalThis.lumiloop = { world, camera, link, late };   // for whoever looks closer, and for the tests
+globalThis.lumiloop = { world, camera, link, late };   // for debugging and for the tests

@@ -1,4 +1,4 @@
-// Buttons that order something of the daemon, the pose that is dragged, and what became of orders.
+// Command buttons, the dragged pose, and the outcomes of commands.
 
 import { $, element } from "./panel.js";
 
@@ -11,7 +11,7 @@ export class Orders {
     this.camera = camera;
     this.toast = toast;
     this.told = [];
-    this.sent = [];          // orders of which nothing has been told yet
+    this.sent = [];          // commands without a reply yet
     for (const button of document.querySelectorAll("[data-order]")) button.addEventListener("click", () => this.press(button.dataset.order));
     $("ask-yes").addEventListener("click", () => this.send("set_pose", this.pose));
     $("ask-no").addEventListener("click", () => this.aim(false));
@@ -49,7 +49,7 @@ export class Orders {
     for (const order of unknown) this.take({ order, viewer: this.you, outcome: "connection lost, perhaps before it arrived" });
   }
 
-  // From here on hands drag a pose, or the map again.
+  // Switch dragging between a pose and the map.
   aim(on) {
     this.camera.aiming = on;
     this.camera.aim = null;

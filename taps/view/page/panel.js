@@ -1,7 +1,7 @@
-// The cards beside the map: words and figures. Each is touched only where it has changed.
+// The cards beside the map: texts and numbers. Only changed ones are updated.
 
-const FAULTS = 3;         // shown at once, the gravest
-const WEAKEST = 1e-10;   // A: where a strength's bar begins
+const FAULTS = 3;         // most faults shown, the most severe ones
+const WEAKEST = 1e-10;   // A: lower end of the RSS bar
 
 const shown = new Map();
 export const $ = (id) => document.getElementById(id);
@@ -19,7 +19,7 @@ export function element(tag, cls, text) {
   return made;
 }
 
-// Text in which `names` are set as such.
+// Text with `names` marked as code.
 function marked(text) { return (text || "").split("`").map((part, k) => (k % 2 ? element("code", "", part) : part)); }
 
 function worded(id, text) {
@@ -50,7 +50,7 @@ export class Panel {
     const meaning = gone || (pose ? pose.reason ? pose.meaning : table ? table[1] : "" : "waiting for the first pose");
     put("why", pose && !gone && pose.reason ? pose.meaning : "");
     worded("meaning", meaning || " ");
-    $("meaning").classList.toggle("path", meaning.startsWith("/")); // which has no capitals of ours
+    $("meaning").classList.toggle("path", meaning.startsWith("/")); // a path keeps its case
     worded("remedy", gone || !pose ? "" : pose.remedy || "");
     this.faults(gone ? [] : this.world.faults);
   }

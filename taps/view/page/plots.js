@@ -67,7 +67,7 @@ export class Plots {
     context.fillText(`${top % 1 ? top.toFixed(1) : top} ${plot.unit}`, width, 8);
   }
 
-  // A scale that a single peak does not spoil: twice what 98 of 100 stay below, at most the largest.
+  // A scale robust to a single peak: twice the 98th percentile, at most the maximum.
   top(plot, rows) {
     const values = [];
     for (const [name, , factor] of plot.lines) for (const row of rows) if (row[COLUMNS[name]] !== null) values.push(row[COLUMNS[name]] * factor);
@@ -77,7 +77,7 @@ export class Plots {
     return [1, 2, 3, 5, 10].map((k) => k * size).find((value) => value >= wanted * 0.999);
   }
 
-  // The state of each time as a line at the bottom.
+  // The state over time as a line at the bottom.
   states(context, rows, x, height, colours) {
     for (let i = 1; i < rows.length; i++) {
       context.fillStyle = colours[STATES[rows[i][COLUMNS.state]] || "faint"];

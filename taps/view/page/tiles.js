@@ -1,4 +1,4 @@
-// The map: tiles of log-odds as small pictures, coloured as the theme has it.
+// The map: tiles of log-odds as small images in the colours of the theme.
 
 const SEEN = 12, CLEAR = 8;   // log-odds, in units of the stream's 0.1, at which a cell has its full colour
 
@@ -42,7 +42,7 @@ export class Tiles {
     this.changed();
   }
 
-  // (x0, y0, x1, y1) in m of all that has something in it; null: nothing has.
+  // Bounding box (x0, y0, x1, y1) of the known cells, m; null: none.
   extent() {
     let box = null;
     for (const tile of this.all.values()) {
@@ -76,7 +76,7 @@ async function inflated(packed) {
 }
 
 function filled(tile) {
-  const { cells, side } = tile, box = [side, side, 0, 0];   // of what stands there, not of what is seen through a door
+  const { cells, side } = tile, box = [side, side, 0, 0];   // of occupied cells, not of those seen through a door
   for (let row = 0, at = 0; row < side; row++) {
     for (let column = 0; column < side; column++, at++) {
       if (cells[at] <= 0) continue;

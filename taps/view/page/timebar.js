@@ -10,7 +10,7 @@ export class TimeBar {
     this.link = link;
     this.world = world;
     this.film = null;
-    this.seen = new Map();   // state by part of the bar, as far as it was watched
+    this.seen = new Map();   // state by part of the bar, where already played
     $("play").addEventListener("click", () => this.toggle());
     $("rate").addEventListener("change", () => link.say({ play: { speed: Number($("rate").value) } }));
     $("seek").addEventListener("input", () => { this.held = true; this.time(Number($("seek").value)); this.ask(); });
@@ -25,7 +25,7 @@ export class TimeBar {
 
   toggle() { this.link.say({ play: { paused: !this.film.paused } }); }
 
-  // A drag asks for many instants: one at a time.
+  // A drag produces many seeks: send one at a time.
   ask() {
     if (this.asking) return;
     this.asking = setTimeout(() => { this.asking = 0; this.link.say({ play: { at: Number($("seek").value) } }); }, 60);

@@ -1,4 +1,4 @@
-// What is known of the robot: the newest of each topic, and the way behind it.
+// The state of the robot: the latest message of each topic, and its trajectory.
 
 import { Tiles } from "./tiles.js";
 
@@ -12,7 +12,7 @@ export class World {
     this.forget();
   }
 
-  // Another daemon, or another moment of a recording.
+  // Another daemon, or another time of a recording.
   forget(keepTiles = false) {
     this.pose = this.lights = this.scan = this.statistics = null;
     this.poses = [];
@@ -83,7 +83,7 @@ export class World {
     if (this.trail.length > TRAIL) this.trail.splice(0, TRAIL / 8);
   }
 
-  // Where the robot was at an instant, between the poses that are known; null: there are none.
+  // The interpolated pose at a time; null: no poses.
   at(t) {
     const all = this.poses;
     if (!all.length) return null;
@@ -96,7 +96,7 @@ export class World {
     return a.pose.map((value, k) => value + part * (k === 2 ? turned(b.pose[2] - a.pose[2]) : b.pose[k] - value));
   }
 
-  // The latest scan as points of the map, x and y in turn; null: there is none, or no pose.
+  // The latest scan as points of the map, x and y alternating; null: no scan or no pose.
   points() {
     const scan = this.scan;
     if (!scan || !this.pose || !this.pose.pose || Math.abs(this.pose.t_mono - scan.t_mono) > 1) return null;
