@@ -31,7 +31,7 @@ RUN: Final = {
         r"(maps.md: lumiloop map export drive|replay.md: lumiloop replay intel).*",
     ),
     "alone": (
-        r"air-interface.md: lumiloop codes", r"simulator.md: python -m tools.sim.(report|draw|light.draw)",
+        r"air-interface.md: lumiloop codes", r"simulator.md: python -m tools.sim.(report|building.draw|light.draw)",
         r"bench.md: python -m tools.bench.world --list",
     ),
 }  # fmt: skip
