@@ -33,9 +33,9 @@ from estimator.result import Fix, LightsResult, Virtual
 
 BASE_M: Final = 1.0
 """Extent of the path over which the initialisation aligns, m."""
-APART_M: Final = 0.05
+SPACING_M: Final = 0.05
 """Path length between two positions of the initialisation, m."""
-PLACES: Final = 200
+CAPACITY: Final = 200
 """Most positions of an initialisation; the oldest are dropped, so that wheel slip does not block it for good."""
 FITS: Final = 0.5
 """Largest RMS distance of the positions from the aligned path, as a share of the path's RMS extent, for acceptance."""
@@ -48,7 +48,7 @@ class LightPose:
 
     Attributes:
         settings: solver and Link_n.
-        T, P: pose (x, y, yaw) and covariance (3, 3) at ``t_mono``. They are in the survey frame once ``placed``, before
+        T, P: pose (x, y, yaw) and covariance (3, 3) at ``t_mono``. In the survey frame once ``aligned``, before
             that in the frame of the odometry's start.
         velocity: (v_x, v_y, yaw rate), base frame.
         selection: links and position of the latest epoch.
@@ -64,16 +64,16 @@ class LightPose:
         self.lever = np.array((setup.survey.receiver.x, setup.survey.receiver.y))
         self.T, self.P, self.velocity = se2.identity(), np.zeros((3, 3)), np.zeros(3)
         self.t_mono = self.t_epoch = -math.inf
-        self.placed = False
+        self.aligned = False
         self.selection = PAUSED
-        self._start: deque[tuple[Array, Array]] = deque(maxlen=PLACES)
+        self._start: deque[tuple[Array, Array]] = deque(maxlen=CAPACITY)
         self.result = self._result(None)
 
-    def take(self, record: Record) -> None:
+    def receive(self, record: Record) -> None:
         """Process odometry, a block of samples or an epoch; ignore other records."""
         match record:
             case Odometry():
-                self.move(record)
+                self.predict(record)
             case SampleBlock():
                 self.update(decoder.decode(self.decoder, record))
             case LightEpoch():
@@ -83,7 +83,7 @@ class LightPose:
         """Continue the acquisition of lamps, with an effort of so many codes."""
         decoder.search(self.decoder, codes)
 
-    def move(self, record: Odometry) -> None:
+    def predict(self, record: Odometry) -> None:
         """Prediction: the pose and its covariance after an odometry increment."""
         dt = record.t_end - record.t_begin
         if not (dt > 0.0 and np.isfinite(record.delta).all()):
@@ -104,20 +104,20 @@ class LightPose:
         """Eq. 3-7: select the links, solve for the position, and update the pose or the initialisation with it."""
         T = self.at(0.5 * (epoch.t_begin + epoch.t_end))
         receiver, J = self._receiver(T)
-        prior = Prior(receiver, J @ self.P @ J.T + 1e-6 * np.eye(2)) if self.placed else None
+        prior = Prior(receiver, J @ self.P @ J.T + 1e-6 * np.eye(2)) if self.aligned else None
         self.selection = select(epoch, self.catalogue, self.setup.survey, self.settings, prior)
         self.t_epoch = epoch.t_end
-        place = self.selection.place
-        if place is not None and self.placed:
-            self._correct(place, receiver, J)
-        elif place is not None:
-            self._begin(place, receiver)
+        position = self.selection.position
+        if position is not None and self.aligned:
+            self._correct(position, receiver, J)
+        elif position is not None:
+            self._align(position, receiver)
         self.result = self._result(epoch)
 
     def virtual(self, t_mono: float) -> Virtual | None:
         """The light solution at an instant: the virtual components; None while light is paused."""
         accepted = self.selection.accepted
-        if not (self.placed and accepted and t_mono - self.t_epoch < STALE_S):
+        if not (self.aligned and accepted and t_mono - self.t_epoch < STALE_S):
             return None
         return Virtual(self.at(t_mono), self.P, accepted)
 
@@ -131,40 +131,40 @@ class LightPose:
         lever = se2.rotation(T[2])[:2, :2] @ self.lever
         return T[:2] + lever, np.array(((1.0, 0.0, -lever[1]), (0.0, 1.0, lever[0])))
 
-    def _correct(self, place: Place, receiver: Array, J: Array) -> None:
+    def _correct(self, position: Place, receiver: Array, J: Array) -> None:
         """EKF update by a position (Joseph form)."""
-        K = self.P @ J.T @ np.linalg.inv(J @ self.P @ J.T + place.covariance)
+        K = self.P @ J.T @ np.linalg.inv(J @ self.P @ J.T + position.covariance)
         keep = np.eye(3) - K @ J
-        self.T = self.T + K @ (place.xy - receiver)
+        self.T = self.T + K @ (position.xy - receiver)
         self.T[2] = se2.wrap(float(self.T[2]))
-        self.P = symmetric(keep @ self.P @ keep.T + K @ place.covariance @ K.T)
+        self.P = symmetric(keep @ self.P @ keep.T + K @ position.covariance @ K.T)
 
-    def _begin(self, place: Place, receiver: Array) -> None:
+    def _align(self, position: Place, receiver: Array) -> None:
         """Keep a position, and align the odometry path with the positions once it is long enough (Eq. 13)."""
-        if self._start and math.dist(self._start[-1][0], receiver) < APART_M:
+        if self._start and math.dist(self._start[-1][0], receiver) < SPACING_M:
             return
-        self._start.append((receiver, place.xy))
-        way, places = (np.ascontiguousarray(side) for side in zip(*self._start, strict=True))
-        around = way - way.mean(axis=0)
+        self._start.append((receiver, position.xy))
+        path, positions = (np.ascontiguousarray(side) for side in zip(*self._start, strict=True))
+        around = path - path.mean(axis=0)
         if 2.0 * float(np.hypot(*around.T).max()) < BASE_M:
             return
-        T_map_wheels = np.empty(3)
-        align(way, places, T_map_wheels)
+        T_map_odom = np.empty(3)
+        align(path, positions, T_map_odom)
         extent2 = float(np.mean((around**2).sum(axis=1)))
-        square = float(np.mean(((se2.apply(T_map_wheels, way) - places) ** 2).sum(axis=1)))
+        square = float(np.mean(((se2.apply(T_map_odom, path) - positions) ** 2).sum(axis=1)))
         if square > FITS**2 * extent2:
             return
-        doubt = 0.5 * max(square, float(np.trace(place.covariance)))
-        self.T = se2.compose(T_map_wheels, self.T)
-        self.P = np.diag((doubt, doubt, 2.0 * doubt / extent2))
-        self.placed = True
+        variance = 0.5 * max(square, float(np.trace(position.covariance)))
+        self.T = se2.compose(T_map_odom, self.T)
+        self.P = np.diag((variance, variance, 2.0 * variance / extent2))
+        self.aligned = True
         self._start.clear()
 
     def _result(self, epoch: LightEpoch | None) -> LightsResult:
         """The result after an epoch."""
         accepted, nothing = self.selection.accepted, np.zeros((3, 3))
-        found, paused = (Fix.GOOD, Fix.HELD) if self.placed else (Fix.STARTING, Fix.NONE)
-        xy = self._receiver(self.at(self.t_epoch))[0] if self.placed else None
+        found, paused = (Fix.GOOD, Fix.HELD) if self.aligned else (Fix.STARTING, Fix.NONE)
+        xy = self._receiver(self.at(self.t_epoch))[0] if self.aligned else None
         return LightsResult(
             t_mono=self.t_epoch,
             fix=found if accepted else paused,

@@ -83,7 +83,7 @@ class PaperMethod:
     Attributes:
         light: the light solution, None without a photodiode.
         matcher: the scan matcher, with T1 from it.
-        placed: whether the map frame is the survey frame.
+        aligned: whether the map frame is the survey frame.
     """
 
     def __init__(self, settings: Settings, lights: LightsSetup | None, link_n: int = LINK_N) -> None:
@@ -91,7 +91,7 @@ class PaperMethod:
         self.light = None if lights is None else LightPose(lights, settings.noise, link_n)
         self.lit = lights is not None
         self.matcher = PointToPoint(settings.far_m, first=self._first)
-        self.placed = False
+        self.aligned = False
         printed = replace(settings, match=self.matcher, newest_only=True, light_pose=self._virtual)
         self.state = pipeline.new_state(printed)
         self._before: tuple[float, Array] | None = None
@@ -104,15 +104,15 @@ class PaperMethod:
         t_scan = next((record.t_end for record in ordered if isinstance(record, Scan)), math.inf)
         for record in ordered:
             if -math.inf < pipeline.order(record)[0] <= t_scan:
-                self.light.take(record)
+                self.light.receive(record)
         lap("lights")
         result = pipeline.step(self.state, ordered, limits, lap)
-        self._guide(result)
+        self._predict_without_odometry(result)
         for record in ordered:
             if pipeline.order(record)[0] > t_scan:
-                self.light.take(record)
+                self.light.receive(record)
             if isinstance(record, Command) and record.order in (Order.RESET, Order.SET_POSE):
-                self.placed = False
+                self.aligned = False
         self.light.search(limits.codes)
         if result.keyframe >= 0:
             self._scan_to_map(result)
@@ -121,7 +121,7 @@ class PaperMethod:
             T_map_odom=self.state.pose.T_map_odom,
             jumps=self.state.pose.jumps,
             lights=self.light.result,
-            placed=self.placed,
+            placed=self.aligned,
             protection=None,
         )
 
@@ -146,19 +146,19 @@ class PaperMethod:
             return
         T2 = se2.compose(result.T_map_odom, result.T_odom_base)
         T, since = light.T_map_base, 0
-        if self.placed:
+        if self.aligned:
             T, since = np.empty(3), result.keyframe
             combine(light.T_map_base, T2, self.matcher.share * np.eye(3), T)
         T_map_odom = se2.compose(T, se2.inverse(result.T_odom_base))
         apply_correction(self.state.map, self.state.pose, T_map_odom, since, result.T_odom_base)
-        self.placed = True
+        self.aligned = True
 
-    def _guide(self, result: StepResult) -> None:
+    def _predict_without_odometry(self, result: StepResult) -> None:
         """Without odometry, the motion between steps moves the light solution."""
         assert self.light is not None
         before, self._before = self._before, (result.t_mono, result.T_odom_base)
         if before is not None and not self.state.motion.odometry:
-            self.light.move(Odometry(before[0], result.t_mono, se2.between(before[1], result.T_odom_base)))
+            self.light.predict(Odometry(before[0], result.t_mono, se2.between(before[1], result.T_odom_base)))
 
 
 BY_NAME: Final[dict[str, Callable[[Settings, LightsSetup | None], Method]]] = {

@@ -27,7 +27,7 @@ FAINT: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heard:
+class ReceivedLink:
     """One link of an epoch: its lamp, None where that is not known, and whether it may be used."""
 
     code: int
@@ -42,23 +42,23 @@ class Selection:
     """Result of the selection in one epoch.
 
     Attributes:
-        heard: every link, the strongest first.
-        clear: S, as indices in ``heard``, the shortest link first.
+        received: every link, the strongest first.
+        clear: S, as indices in ``received``, the shortest link first.
         used: the Link_n shortest of S as input of the solvers; None where light is paused.
-        place: position of the receiver by Eq. 3, 4; None where light is paused or the lamps leave it ambiguous.
+        position: of the receiver by Eq. 3, 4; None where light is paused or the lamps leave it ambiguous.
     """
 
-    heard: tuple[Heard, ...]
+    received: tuple[ReceivedLink, ...]
     clear: tuple[int, ...]
     used: Links | None = None
-    place: Place | None = None
+    position: Place | None = None
 
     @property
     def accepted(self) -> frozenset[int]:
         """Numbers of the lamps whose links determine the position; empty without a position."""
-        if self.used is None or self.place is None:
+        if self.used is None or self.position is None:
             return frozenset()
-        lamps = (self.heard[self.clear[i]].lamp for i in range(len(self.used.d)))
+        lamps = (self.received[self.clear[i]].lamp for i in range(len(self.used.d)))
         return frozenset(lamp.lamp_id for lamp in lamps if lamp is not None)
 
 
@@ -79,7 +79,7 @@ def select(
     """
     if epoch.block & UNUSABLE:
         return PAUSED
-    rows = [heard(epoch, k, catalogue, prior) for k in range(len(epoch.ids))]
+    rows = [received_link(epoch, k, catalogue, prior) for k in range(len(epoch.ids))]
     rows.sort(key=lambda one: -one.rss)
     fit = [k for k, one in enumerate(rows) if one.state is LinkState.ACCEPTED]
     received = Received(
@@ -93,25 +93,25 @@ def select(
     if len(clear) < max(n, 1):
         return Selection(tuple(rows), clear)
     located = locate(received, survey, settings, prior)
-    place = located.places[0] if located.why in (Why.PLACE, Why.PRIOR) else None
-    return Selection(tuple(rows), clear, links.pick(range(n)), place)
+    position = located.places[0] if located.why in (Why.PLACE, Why.PRIOR) else None
+    return Selection(tuple(rows), clear, links.pick(range(n)), position)
 
 
-def heard(epoch: LightEpoch, k: int, catalogue: Catalogue, prior: Prior | None) -> Heard:
+def received_link(epoch: LightEpoch, k: int, catalogue: Catalogue, prior: Prior | None) -> ReceivedLink:
     """The ``k``-th link of an epoch with its lamp."""
     code, flags = int(epoch.ids[k]), int(epoch.flags[k])
     rss, variance = float(epoch.amplitude[k]), float(epoch.variance[k])
     if not (0.0 < rss < math.inf and 0.0 <= variance < math.inf):
-        return Heard(code, 0.0, math.inf, None, LinkState.FAINT)
+        return ReceivedLink(code, 0.0, math.inf, None, LinkState.FAINT)
     frame = epoch.lamps[k]
     lamps = catalogue.candidates(code) if frame is None else [catalogue.learn(frame, code, epoch.t_end)[0]]
     if not lamps:
-        return Heard(code, rss, variance, None, LinkState.UNSURVEYED)
-    twin = len(lamps) > 1 and (prior is None or bool(flags & LinkFlag.TWIN))
+        return ReceivedLink(code, rss, variance, None, LinkState.UNSURVEYED)
+    duplicate = len(lamps) > 1 and (prior is None or bool(flags & LinkFlag.TWIN))
     lamp = lamps[0] if prior is None else nearest(lamps, prior.xy)
     if flags & LinkFlag.FAINT or rss <= FAINT * math.sqrt(variance):
-        return Heard(code, rss, variance, lamp, LinkState.FAINT)
-    return Heard(code, rss, variance, lamp, LinkState.TWIN if twin else LinkState.ACCEPTED)
+        return ReceivedLink(code, rss, variance, lamp, LinkState.FAINT)
+    return ReceivedLink(code, rss, variance, lamp, LinkState.TWIN if duplicate else LinkState.ACCEPTED)
 
 
 def nearest(lamps: list[Lamp], xy: Array) -> Lamp:
@@ -121,13 +121,15 @@ def nearest(lamps: list[Lamp], xy: Array) -> Lamp:
 
 def links_of(selection: Selection, settings: SolverSettings, xy: Array | None) -> tuple[Link, ...]:
     """The links as results, strongest first; residuals for the receiver at ``xy`` (None: not known)."""
-    used = set() if selection.place is None or selection.used is None else set(selection.clear[: len(selection.used.d)])
+    used = (
+        set() if selection.position is None or selection.used is None else set(selection.clear[: len(selection.used.d)])
+    )
     residuals = dict[int, tuple[float, float]]()
     if xy is not None and selection.used is not None:
         both = zip(*deviations(selection.used, settings, xy), strict=True)
         residuals = dict(zip(selection.clear, ((float(r), float(s)) for r, s in both), strict=False))
     found = []
-    for k, one in enumerate(selection.heard):
+    for k, one in enumerate(selection.received):
         state = one.state
         if state is LinkState.ACCEPTED:
             state = LinkState.RIM if k not in selection.clear else state if k in used else LinkState.PAUSED

@@ -29,9 +29,9 @@ def fresh() -> LightPose:
 def drive(light: LightPose, steps: int, T: Array, t: float = 0.0, codes: range = range(9)) -> tuple[Array, float]:
     """Exact wheels and exact epochs, in turn; the pose and instant at the end."""
     for _ in range(steps):
-        light.take(Odometry(t, t + 0.05, STEP))
+        light.receive(Odometry(t, t + 0.05, STEP))
         T, t = se2.compose(T, STEP), t + 0.05
-        light.take(replace(epoch_at(T, t, codes), t_begin=t, t_end=t))
+        light.receive(replace(epoch_at(T, t, codes), t_begin=t, t_end=t))
     return T, t
 
 
@@ -39,7 +39,7 @@ def test_the_start_brings_the_wheels_onto_the_places() -> None:
     """Eq. 13 on exact places gives the true pose as soon as the way is long enough, and not before."""
     light, steps = fresh(), 0
     T, t = START, 0.0
-    while not light.placed:
+    while not light.aligned:
         assert light.result.fix in (Fix.NONE, Fix.STARTING)
         assert light.virtual(t) is None
         T, t = drive(light, 1, T, t)
@@ -58,17 +58,17 @@ def test_a_way_that_does_not_fit_the_places_is_no_start() -> None:
     """Wheels that report a small circle while the robot drives straight on."""
     light = fresh()
     for k in range(17):
-        light.take(Odometry(0.05 * k, 0.05 * k + 0.05, np.array((0.1, 0.0, 0.19))))
-        light.take(epoch_at(np.array((0.25 * k, 2.0, 0.0)), 0.05 * k + 0.05))
+        light.receive(Odometry(0.05 * k, 0.05 * k + 0.05, np.array((0.1, 0.0, 0.19))))
+        light.receive(epoch_at(np.array((0.25 * k, 2.0, 0.0)), 0.05 * k + 0.05))
     assert math.dist(light.T[:2], (0.0, 0.0)) > BASE_M
-    assert not light.placed
+    assert not light.aligned
 
 
 def test_without_movement_there_is_no_heading() -> None:
     light = fresh()
     for k in range(40):
-        light.take(epoch_at(START, 0.05 * k))
-    assert not light.placed
+        light.receive(epoch_at(START, 0.05 * k))
+    assert not light.aligned
     assert light.result.fix is Fix.STARTING
 
 
@@ -81,7 +81,7 @@ def test_the_prediction_is_that_of_a_numerical_jacobian() -> None:
     G = numeric(lambda d: se2.compose(light.T, d), np.zeros(3))
     expected = F @ light.P @ F.T + G @ np.diag(odometry_variance(delta, 0.05, NOISE)) @ G.T
     T = se2.compose(light.T, delta)
-    light.move(Odometry(0.0, 0.05, delta))
+    light.predict(Odometry(0.0, 0.05, delta))
     np.testing.assert_allclose(light.P, expected, atol=1e-7)
     np.testing.assert_allclose(light.T, T)
     np.testing.assert_allclose(light.at(0.05), T)
@@ -94,23 +94,23 @@ def test_the_update_is_the_kalman_update_in_information_form() -> None:
     T, t = drive(light, 60, START)
     light.T, light.P = light.T + np.array((0.1, -0.05, 0.04)), np.diag((0.02, 0.03, 0.01))
     before, P = light.T, light.P
-    light.take(replace(epoch_at(T, t), t_begin=t, t_end=t))
-    place = light.selection.place
-    assert place is not None
+    light.receive(replace(epoch_at(T, t), t_begin=t, t_end=t))
+    position = light.selection.position
+    assert position is not None
     J = numeric(lambda T: receiver_at(T), before)
-    np.testing.assert_allclose(place.xy, receiver_at(T), atol=1e-6)
-    Q = np.linalg.inv(place.covariance)
+    np.testing.assert_allclose(position.xy, receiver_at(T), atol=1e-6)
+    Q = np.linalg.inv(position.covariance)
     after = np.linalg.inv(np.linalg.inv(P) + J.T @ Q @ J)
     np.testing.assert_allclose(light.P, after, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(light.T, before + after @ J.T @ Q @ (place.xy - receiver_at(before)), atol=1e-7)
+    np.testing.assert_allclose(light.T, before + after @ J.T @ Q @ (position.xy - receiver_at(before)), atol=1e-7)
 
 
 def test_an_epoch_is_compared_with_where_the_robot_was() -> None:
     """An epoch is true for its middle; a robot that has driven on since is not pulled back."""
     light = fresh()
     T, t = drive(light, 60, START)
-    light.take(Odometry(t, t + 0.05, STEP))
-    light.take(epoch_at(T, t))
+    light.receive(Odometry(t, t + 0.05, STEP))
+    light.receive(epoch_at(T, t))
     np.testing.assert_allclose(light.T, se2.compose(T, STEP), atol=1e-4)
 
 
@@ -145,7 +145,7 @@ def test_misfit_is_of_the_links_at_the_pose() -> None:
 )
 def test_wheels_that_say_nothing_move_nothing(record: Odometry) -> None:
     light = fresh()
-    light.take(record)
+    light.receive(record)
     np.testing.assert_array_equal(light.T, np.zeros(3))
     np.testing.assert_array_equal(light.P, np.zeros((3, 3)))
 

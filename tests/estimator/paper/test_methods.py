@@ -186,7 +186,7 @@ def test_a_keyframe_moves_the_pose_in_the_map_by_the_weight() -> None:
     """By hand: with the weight 0.25 the robot moves a quarter of the way to where light has it, and the map stays."""
     done = Drive(8.0)
     paper, result = done.paper, done.results[-1]
-    assert paper.placed
+    assert paper.aligned
     assert paper.light is not None
     first = next(iter(paper.state.map.keyframes.values()))
     laid, newest = first.T_map_keyframe, max(paper.state.map.keyframes)

@@ -37,8 +37,8 @@ def states(found: Selection, xy: Array | None = None) -> dict[int, LinkState]:
 def test_the_four_shortest_links_give_the_place() -> None:
     """Distances by inversion of Eq. 1 and 2 are exact here, so the place of Eq. 4 is; the others are paused."""
     found = selected(epoch_at(T))
-    assert found.place is not None
-    np.testing.assert_allclose(found.place.xy, XY, atol=1e-6)
+    assert found.position is not None
+    np.testing.assert_allclose(found.position.xy, XY, atol=1e-6)
     nearest = sorted(GRID, key=lambda lamp: math.hypot(lamp.x - XY[0], lamp.y - XY[1]))
     used = {lamp.code for lamp in nearest[:4]}
     assert found.accepted == {GRID[code].lamp_id for code in used}
@@ -53,24 +53,24 @@ def test_the_shortest_link_is_not_always_the_strongest() -> None:
     dim = replace(near, power_w=0.01 * near.power_w)
     survey = replace(SURVEY, lamps=tuple(dim if lamp is near else lamp for lamp in GRID))
     found = selected(epoch_of([(lamp.code, rss_of(lamp, XY)) for lamp in survey.lamps]), survey=survey)
-    assert found.heard[found.clear[0]].code == near.code
+    assert found.received[found.clear[0]].code == near.code
     assert near.lamp_id in found.accepted
 
 
 def test_fewer_than_link_n_clear_links_pause_light_as_a_whole() -> None:
     for count in (1, 2, 3):
         found = selected(epoch_at(T, codes=range(count)))
-        assert found.place is None
+        assert found.position is None
         assert found.accepted == frozenset()
         assert set(states(found).values()) == {LinkState.PAUSED}
-    assert selected(epoch_at(T, codes=(0, 1, 3, 4))).place is not None
+    assert selected(epoch_at(T, codes=(0, 1, 3, 4))).position is not None
 
 
 def test_link_n_is_a_setting() -> None:
     epoch = epoch_at(T, codes=range(6))
     assert len(selected(epoch, settings=SolverSettings(Solver.LS, 3)).accepted) == 3
     assert len(selected(epoch, settings=SolverSettings(Solver.LS, 6)).accepted) == 6
-    assert selected(epoch, settings=SolverSettings(Solver.LS, 7)).place is None
+    assert selected(epoch, settings=SolverSettings(Solver.LS, 7)).position is None
 
 
 def test_a_link_is_paused_by_itself() -> None:
@@ -78,14 +78,14 @@ def test_a_link_is_paused_by_itself() -> None:
     strengths = {code: rss_of(GRID[code], XY) for code in (0, 1, 3, 4)}
     links = [*strengths.items(), (77, 1e-6), (5, 1e-10), (7, 7e-10), (8, math.nan)]
     found = selected(epoch_of(links))
-    assert found.place is not None
-    np.testing.assert_allclose(found.place.xy, XY, atol=1e-6)
+    assert found.position is not None
+    np.testing.assert_allclose(found.position.xy, XY, atol=1e-6)
     assert states(found) == {
         **dict.fromkeys(strengths, LinkState.ACCEPTED),
         **{77: LinkState.UNSURVEYED, 5: LinkState.FAINT, 7: LinkState.RIM, 8: LinkState.FAINT},
     }
     flagged = selected(epoch_of(strengths.items(), flags={4: LinkFlag.FAINT}))
-    assert flagged.place is None
+    assert flagged.position is None
     assert states(flagged)[4] is LinkState.FAINT
 
 
@@ -112,20 +112,20 @@ def test_a_lamp_may_describe_itself() -> None:
     survey, new = replace(SURVEY, lamps=GRID[:4]), GRID[4]
     frame = LampFrame(new.lamp_id, new.x, new.y, new.z, new.power_w, math.degrees(math.acos(2 ** (-1 / new.order))))
     links = [(code, rss_of(GRID[code], XY)) for code in (0, 1, 3, 4)]
-    assert selected(epoch_of(links), survey=survey).place is None
+    assert selected(epoch_of(links), survey=survey).position is None
     found = selected(epoch_of(links, frames={4: frame}), survey=survey)
-    assert found.place is not None
+    assert found.position is not None
     assert new.lamp_id in found.accepted
-    np.testing.assert_allclose(found.place.xy, XY, atol=1e-3)
+    np.testing.assert_allclose(found.position.xy, XY, atol=1e-3)
 
 
 def test_lamps_in_a_line_leave_two_places_until_one_is_known() -> None:
     epoch = epoch_of([(code, rss_of(GRID[code], XY)) for code in (0, 3, 6)])
     settings = SolverSettings(Solver.LS, 3)
-    assert selected(epoch, settings=settings).place is None
+    assert selected(epoch, settings=settings).position is None
     found = selected(epoch, Prior(XY + 0.2, 0.04 * np.eye(2)), settings=settings)
-    assert found.place is not None
-    np.testing.assert_allclose(found.place.xy, XY, atol=1e-5)
+    assert found.position is not None
+    np.testing.assert_allclose(found.position.xy, XY, atol=1e-5)
 
 
 def test_residuals_are_of_received_against_expected_rss() -> None:
