@@ -13,13 +13,11 @@ Every hot function is a plain Python function with this decorator:
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Final, ParamSpec, TypeVar
 
-import llvmlite.binding
 import numba
 from numba.core import config
 
@@ -114,15 +112,3 @@ def _compile_on_use(compiled: Any, signature: str) -> None:
         return compiled  # the caller calls the returned dispatcher
 
     compiled.get_call_template, compiled._compile_for_args = get_call_template, compile_for_args
-
-
-def _announce_no_calls() -> None:
-    """Clear numba's list of LLVM call listeners, which has no use here.
-
-    A start makes 20 000 calls of LLVM and spends a sixth of its time on the listeners.
-    """
-    with contextlib.suppress(AttributeError):  # private upstream
-        llvmlite.binding.ffi.lib._lock._cblist.clear()
-
-
-_announce_no_calls()

@@ -70,8 +70,6 @@ _known: Final = (
     and all(hasattr(_upstream.JITCodeLibrary, part) for part in _parts)
     and hasattr(_runtime, "c_helpers")
 )
-if _known:
-    _upstream.JITCPUCodegen._library_class = _Kept
 
 
 @cache
@@ -95,7 +93,12 @@ def loaded(compiled: Any, signature: str) -> bool:
     with global_compiler_lock:
         context = compiled.targetctx
         _name_helpers()
-        kept = compiled._cache._load_overload(signature, context)
+        maker = context.codegen()
+        maker._library_class = _Kept  # on this one object, and only while the kernel is loaded
+        try:
+            kept = compiled._cache._load_overload(signature, context)
+        finally:
+            del maker._library_class
         if kept is None:
             return False
         context.insert_user_function(kept.entry_point, kept.fndesc, [kept.library])

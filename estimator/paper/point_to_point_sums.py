@@ -100,7 +100,7 @@ def closed_form(m: Array, T: Array) -> bool:
     return True
 
 
-@kernel("void(f8[:, ::1], f8[:, ::1], f8[::1])", inner=True)
+@kernel("void(f8[:, ::1], f8[:, ::1], f8[::1])")
 def align(q: Array, p: Array, T: Array) -> None:
     """Eq. 13 for given pairs of points (n, 2): writes the T that maps q onto p."""
     m = np.zeros(9)
