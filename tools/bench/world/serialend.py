@@ -47,7 +47,7 @@ class SerialEnd:
         self._loop.add_reader(self._fd, self._read)
         device.attach(self)
 
-    def take(self, data: bytes) -> bool:
+    def accept(self, data: bytes) -> bool:
         """See :class:`hal.fake.lidar.output_line.HostEnd`."""
         if self.lost is not None or len(self._waiting) + len(data) > QUEUE:
             return False

@@ -15,8 +15,8 @@ from dataclasses import replace as changed
 from pathlib import Path
 from typing import Final
 
-from daemon.cli.replay import Outcome, replay
 from daemon.config.schema import Config
+from daemon.replay.log_replay import Outcome, replay
 from estimator.paper import METHODS
 from tools.bench import crispness
 from tools.ci.figures import Figure
