@@ -29,7 +29,7 @@ GAPS = {
 
 def answered(bench: Bench) -> list[float]:
     """Instants at which the sensor answers VV, from now on."""
-    core, times = bench.device._core, []
+    core, times = bench.device._device, []
     send = core.send
 
     def noted(reply: bytes, *, is_scan: bool = False) -> None:
