@@ -124,3 +124,10 @@ def test_no_picture_is_kept_beside_the_one_that_a_command_keeps() -> None:
         set(re.findall(r"`([\w-]+\.png)`", (ROOT / "docs" / "images" / "README.md").read_text())) - {"map.png"}
         == pictures
     )
+
+
+def test_the_glossary_leads_to_files_that_exist() -> None:
+    page = (ROOT / "docs" / "glossary.md").read_text()
+    named = re.findall(r"`((?:estimator|daemon|hal|taps)/[\w/]+(?:\.py|/))`", page)
+    assert len(named) > 40
+    assert [path for path in named if not (ROOT / path).exists()] == []
