@@ -12,7 +12,7 @@ def managed() -> bool:
 
 
 def notify(*words: str) -> None:
-    """Tell the service manager, e.g. ``READY=1``; silently nothing when there is none or it has gone."""
+    """Send a notification, e.g. ``READY=1``, to the service manager; without one, do nothing."""
     if not managed():
         return
     address = os.environ["NOTIFY_SOCKET"]
