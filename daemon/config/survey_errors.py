@@ -1,7 +1,7 @@
 """Readable messages for errors in a lamp survey, all of them at once.
 
-Each message names the file, the line, the lamp, the key, the value found, the values allowed, the purpose of the key
-and an example. For an unknown key it names the nearest valid one.
+Each message names the file, the line, the lamp, the key and the value found. It states the values allowed, the purpose
+of the key and an example. For an unknown key it names the nearest valid one.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Hang detection: each worker thread reports the start time of its current job.
 
 If a restart helps (a computation that hangs), the watchdog is not triggered any more and the service restarts.
-Otherwise the hang is only reported: a thread that hangs in the kernel, at a disk or a bus, would hang in the next
-process too, and the restart would end the present localisation.
+Otherwise the hang is only reported. A thread that hangs in the kernel, at a disk or a bus, would hang in the next
+process too. The restart would end the present localisation for nothing.
 """
 
 from __future__ import annotations

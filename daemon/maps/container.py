@@ -1,7 +1,7 @@
 """Binary container of a map file: named compressed arrays with checksums. Pure: bytes in, bytes out.
 
-Little-endian throughout. A head of 24 bytes, a table with one row of 48 bytes per array, and the arrays, each a chain
-of blocks that are packed separately:
+Little-endian throughout: a head of 24 bytes, a table with one row of 48 bytes per array, and the arrays. An array is a
+chain of blocks that are packed separately:
 
     head    magic (8 bytes), version (u16), arrays (u16), CRC-32 of the table, started with the version (u32),
             length of the file (u64)

@@ -1,8 +1,8 @@
 """Last pose file, stored beside the maps, for the start after a kill or a power cut.
 
 The map is saved every few minutes, the pose up to five times a second while the robot moves, and never at rest.
-The file has two slots that are written alternately, each with a checksum and a number, so that a kill during a write
-leaves the other one. A thread writes; a disk that hangs costs the stored pose and nothing else.
+The file has two slots that are written alternately, each with a checksum and a number. A kill during a write leaves the
+other one. A thread writes; a disk that hangs costs the stored pose and nothing else.
 The file is synced to the disk at most every ten seconds. Memory cards wear, and after a power loss an operator is
 present anyway to switch the robot on.
 """

@@ -4,10 +4,10 @@ A map is written under a temporary name, synced, renamed, read back and compared
 deleted. A power cut, or a kill at any moment, therefore leaves the old map or the new one. A damaged file is renamed
 with the suffix ``.broken``; the newest few of these stay.
 
-Of the map in use, the store keeps the two newest generations, of which one may fail, and the one with which this run
-started. That one is the last that a whole run has confirmed, should this run spoil the map. Of every other map (RESET
-starts one, and each building has its own) the newest good generation is kept, of the seven latest maps. A file is
-deleted only after a newer one has been read.
+Of the map in use, the store keeps the two newest generations, of which one may fail. It also keeps the one with which
+this run started. That one is the last that a whole run has confirmed, should this run spoil the map. Of every other map
+(RESET starts one, and each building has its own) the newest good generation is kept, of the seven latest maps. A file
+is deleted only after a newer one has been read.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 The resource limits are the switch. A unit with ``LimitRTPRIO=`` and ``LimitMEMLOCK=infinity`` dedicates the computer to
 the robot. A run in a terminal, even as root, gets neither.
 
-The other threads run just below the loop's priority and above ordinary programs. This is necessary: while one of them
-holds the interpreter lock and another program has its processor, the loop waits for that program, at any priority of
-its own. With both cores busy, cycles started up to 130 ms late because of this. These threads compute for a few
+The other threads run just below the loop's priority and above ordinary programs. This is necessary: one of them may
+hold the interpreter lock while another program has its processor. The loop then waits for that program, at any priority
+of its own. With both cores busy, cycles started up to 130 ms late because of this. These threads compute for a few
 hundredths of the time only.
 """
 

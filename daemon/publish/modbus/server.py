@@ -3,7 +3,7 @@
 * UDP: one datagram is one request. Nothing is stored between datagrams, so one client cannot disturb another.
 * TCP: every request in a segment is served, in order. A connection that sends other data than Modbus is closed.
 * An iteration of the event loop serves at most 64 requests, so that no number of clients can delay the cycle. These are
-8 on each of two UDP sockets, one on each of at most 32 connections, and 16 of those that wait with more.
+8 on each of two UDP sockets, one on each of at most 32 connections, and 16 from waiting connections.
 * All of them together have half of the loop's time (:mod:`hal.net.fair_share`), at any number and rate of requests.
 * Nothing waits for a client. A reply that the kernel does not accept at once is dropped (UDP). A connection whose
 replies are not read is not served any more, then closed (TCP).

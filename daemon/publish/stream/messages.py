@@ -203,7 +203,7 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Statistics(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``statistics``: counters since the start; seconds unless said otherwise."""
+    """Topic ``statistics``: counters since the start; seconds unless stated otherwise."""
 
     t_mono: float
     uptime: float = 0.0

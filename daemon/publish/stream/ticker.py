@@ -74,7 +74,7 @@ def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, f
 
 
 def figures(facts: CycleFacts) -> dict[str, object]:
-    """Counters since the start, times in s unless said otherwise."""
+    """Counters since the start, times in s unless stated otherwise."""
     lidar, photodiode = facts.lidar, facts.photodiode
     return {
         "t_mono": facts.t_mono,
