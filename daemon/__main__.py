@@ -1,4 +1,4 @@
-"""``python -m daemon``: the same as the ``lumiloop`` command."""
+"""Entry point of ``python -m daemon``, which is the same as the ``lumiloop`` command."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import sys
 
 
 def main() -> int:
-    """Run one command; Ctrl-C while its modules are still being loaded ends it without a word."""
-    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # else it is ignored, and stays so
+    """Run one command and return its exit code. Ctrl-C during the import of its modules ends the process silently."""
+    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # an ignored SIGINT stays ignored
     if raises:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from daemon.cli.parser import main as command

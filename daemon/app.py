@@ -1,7 +1,9 @@
-"""Puts the rooms together, keeps every part running, and stops cleanly; `daemon/cli/run.py` is the command.
+"""The daemon application: builds all components in one place, starts and supervises them, and stops them in order.
 
-Start order: publishers, lidar, photodiode and inputs (their hand-shakes take time), then the estimator is loaded in a
-thread while they do, then cycles. Stop order: cycles, lidar (its laser is switched off), inputs, publishers, recording.
+`daemon/cli/run.py` is the command.
+Start order: publishers, lidar, photodiode and inputs, because their handshakes take time. A thread loads the estimator
+meanwhile; then the cycles start.
+Stop order: cycles, lidar (its laser is switched off), inputs, publishers, recording.
 """
 
 from __future__ import annotations
@@ -66,21 +68,22 @@ __all__ = ["Daemon", "Environment"]
 log = logging.getLogger(__name__)
 
 QUIET_S: Final = 2.0
-"""Seconds a part may take to stop: the lidar has to be told to switch its laser off."""
+"""Longest time in s that a component may take to stop: the lidar has to receive the command that switches its laser
+off."""
 EXTEND_US: Final = 30_000_000
-"""Microseconds by which the service manager is asked, again and again, to go on waiting for the first start."""
+"""Extension in us of the service manager's start timeout, sent repeatedly during the first start."""
 STARTING_S: Final = 900.0
-"""For so long it is asked: a start that hangs for good (at a disk, or behind a process that compiles and does not end)
-is begun anew after that, and finds the kernels that it has compiled."""
+"""The start timeout is extended for this long (s). After that the service manager restarts a start that does not end,
+because of a disk or of another process that compiles. The next start finds the kernels that are compiled already."""
 PLACED: Final = (State.MAPPING, State.TRACKING, State.DEGRADED)
-"""States in which there is a pose to speak of."""
+"""States with a usable pose in the map."""
 
 
 class Daemon:
-    """One run of the daemon: everything is built here, nothing is opened before :meth:`run`.
+    """One run of the daemon. The constructor builds all components; nothing is opened before :meth:`run`.
 
     Raises:
-        SurveyError: the survey of the lamps cannot be used.
+        SurveyError: the lamp survey cannot be used.
     """
 
     def __init__(self, settings: Config, environment: Environment, recorder: Recorder | None = None) -> None:
@@ -133,7 +136,7 @@ class Daemon:
                 fault=self.faults.gravest,
                 condition=reporter,
                 alert_m=settings.integrity.alert_m,
-                t_begun=0.0 if recorder is None else recorder.t_begun,  # a replay begins at the same instant
+                t_begun=0.0 if recorder is None else recorder.t_begun,  # a replay starts at the same instant
             )
         )
         if recorder is not None:
@@ -147,7 +150,7 @@ class Daemon:
         self._on_samples = on_samples if recorder is None else recorder.on_samples(on_samples)
 
     def _first_map_id(self) -> int:
-        """Of the stored map that the run begins with, else a new one."""
+        """Map identity at the start: that of the stored map if there is one, otherwise a new one."""
         start = self._environment.start
         return self._environment.draw_map_id() if start is None else start.stored.meta.map_id
 
@@ -155,7 +158,7 @@ class Daemon:
         """Run until ``stop`` is set.
 
         Raises:
-            Exception: a defect in the cycle itself. The estimate cannot be trusted any more; only a new start helps.
+            Exception: a defect in the cycle itself. The estimate is no longer reliable, so only a restart helps.
         """
         tasks = {name: asyncio.create_task(part, name=name) for name, part in self._parts().items()}
         stopped = asyncio.create_task(stop.wait(), name="stop")
@@ -175,7 +178,10 @@ class Daemon:
             self._keep_sample_clock()
             await _stop(tasks.get("cycle"))
             saving = asyncio.create_task(self.autosaver.finish(stop.is_set()), name="map at the stop")
-            for name in ("lidar", *tasks):  # the lidar before what only listens: its laser is to go off
+            for name in (
+                "lidar",
+                *tasks,
+            ):  # the lidar first, before components that only receive: its laser has to be switched off
                 await _stop(tasks.get(name))
             for task in (stopped, warming):
                 await _stop(task)
@@ -195,17 +201,17 @@ class Daemon:
             self._environment.store.trial.begin()
         if self._environment.start is not None:
             self._begin(self._environment.start.stored.meta.map_id)
-            gc.freeze()  # the map stays
+            gc.freeze()  # excludes the loaded map from garbage collection
             self._remember()
         self.autosaver.loaded()
 
     def _begin(self, map_id: int) -> None:
-        """Load the map that is stored; without it, and under another identity, where nothing can be begun with it.
+        """Load the stored map into the estimator. If it cannot be used, start with a new map under a new identity.
 
-        An earlier generation of it is gone on in as soon as the cycles run, as after the command SWITCH_MAP.
+        As soon as cycles run, an earlier generation of the stored map is loaded, as by the command SWITCH_MAP.
 
         Raises:
-            NoMap: there is none that can be used, and `map.localise` asks for one.
+            NoMap: no stored map can be used, and `map.localise` requires one.
         """
         store = self._environment.store
         try:
@@ -222,7 +228,7 @@ class Daemon:
             self.maps.ask(map_id, lambda why: log.warning("a new map is begun: %s", why) if why else None, patient=True)
 
     def _remember(self) -> None:
-        """Tell the estimator where the run before has left the robot."""
+        """Put the stored pose of the previous run into the inbox as a command to the estimator."""
         pose = None if self.last_pose is None else self.last_pose.of_map(self.cycle.map_id)
         if pose is not None:
             log.info("the robot was last at x %.2f m, y %.2f m, heading %.1f deg", *pose[:2], math.degrees(pose[2]))
@@ -247,7 +253,7 @@ class Daemon:
         runner, autosaver = self._estimator, self.autosaver
 
         def put(switch: Switch | None, taken: Callable[[], None]) -> None:
-            """The cycle takes it over (None: does not after all); the autosaver has it at the same instant."""
+            """Hand a switch to the cycle, or withdraw it (None). The autosaver changes its map at the same instant."""
 
             def take_over(switch: Switch) -> tuple[int, str]:
                 runner.take_over(switch)
@@ -260,7 +266,7 @@ class Daemon:
         return MapSwitch(maps, autosaver, put)
 
     def _parts(self) -> dict[str, Coroutine[None, None, None]]:
-        """What runs beside the cycle, in order of start."""
+        """Supervised components that run beside the cycle, by name, in order of start."""
         parts = {**self.network.parts, "lidar": lambda: self.lidar.run(self._take_scan)}
         if self._environment.store is not None:
             parts["map"] = self.autosaver.run
@@ -275,7 +281,7 @@ class Daemon:
         return {"heartbeat": self.heartbeat.run(), **supervised}
 
     def _watched_threads(self, worker: Worker) -> ThreadWatch:
-        """The threads that are watched."""
+        """Hang detection for every worker thread of this run."""
         threads, autosaver = ThreadWatch(), self.autosaver
         threads.watch(Thread.MAP, lambda: autosaver.busy_since, DISK_S)
         if isinstance(worker, ThreadWorker):
@@ -339,13 +345,13 @@ class Daemon:
             failed.add("last pose")
         if self.autosaver.refused:
             failed.add("stored map")
-        if self.threads.look() - {Thread.I2C}:  # a bus has faults of its own
+        if self.threads.look() - {Thread.I2C}:  # the bus has faults of its own
             failed.add("thread")
         return vitals(self.cycle.facts(), failed, max(lateness, self.pacemaker.latest()))
 
 
 class _FirstPose:
-    """Says once how long the first pose took, from the start of the process."""
+    """Logs once the time in s from the start of the process to the first usable pose."""
 
     def __init__(self) -> None:
         self._said = False
@@ -357,14 +363,14 @@ class _FirstPose:
 
 
 async def _first_to_end(*tasks: asyncio.Task[Any]) -> None:
-    """Wait until one of the tasks ends; raises what it raised."""
+    """Wait until one of the tasks ends, and raise its exception if it failed."""
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     for task in done:
         task.result()
 
 
 async def _stop(task: asyncio.Task[Any] | None) -> None:
-    """Cancel a task and wait for it, but not for ever; what it raises on its way out is logged."""
+    """Cancel a task and wait at most :data:`QUIET_S` for its end; its exception is logged."""
     if task is None or task.done():
         return
     task.cancel()

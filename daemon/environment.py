@@ -1,4 +1,4 @@
-"""What the daemon meets outside itself: clock, ports and buses, drivers, worker, estimator, stored map."""
+"""Replaceable surroundings of the daemon: clock, ports, buses, drivers, worker, estimator start and stored map."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from hal.port.port import PortOpener
 
 
 class LidarMaker(Protocol):
-    """Makes a lidar driver from its configuration."""
+    """Factory of a lidar driver from its configuration."""
 
     def __call__(self, config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
-        """A driver that is not running yet."""
+        """Return a driver that is not running yet."""
         ...
 
 
 def make_lidar(config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
-    """The driver that the device string names; HOKUYO's where it names none.
+    """Return the lidar driver that the device string names, otherwise the HOKUYO driver.
 
     Raises:
         DeviceRefused: there is no such driver.
@@ -52,37 +52,37 @@ def make_lidar(config: LidarConfig, clock: Clock, opener: PortOpener) -> Lidar:
 
 
 class NoLidar:
-    """Stands in the lidar's place where there is none (`hal.lidar.Lidar`)."""
+    """Null lidar for a robot without one: no geometry, no scans (`hal.lidar.Lidar`)."""
 
     def __init__(self) -> None:
         self._status = LidarStatus(dialect="no lidar")
 
     @property
     def geometry(self) -> LidarGeometry | None:
-        """There is none."""
+        """Always None."""
         return None
 
     @property
     def status(self) -> LidarStatus:
-        """Closed, and without an error."""
+        """Status of a closed device without an error."""
         return self._status
 
     async def run(self, on_scan: Callable[[RawScan], None]) -> None:
-        """Nothing comes."""
+        """Wait for ever without a scan."""
         await asyncio.Event().wait()
 
 
 @dataclass(slots=True)
 class Environment:
-    """What the daemon meets outside itself. A test replaces any of it; the defaults are the real thing.
+    """Everything that the daemon uses outside itself. A test replaces any field; the defaults are the real devices.
 
     Attributes:
-        stopwatch: measures stages and budget; None: nothing is measured. sinks: get every snapshot too.
+        stopwatch: measures stages and budget; None: nothing is measured. sinks: receive every snapshot too.
         warm_up: loads the estimator. draw_map_id: identity of a new map frame.
-        lights: survey and sample clock; None: as configured, and a sample clock that is to be found.
-        sample_clock: keeps the sample clock; None: it is not kept.
-        store: keeps maps; None: they are not kept. start: the map that the run begins with.
-        stream: path of the local stream; None: there is none.
+        lights: survey and sample clock; None: as configured, and the sample clock has to be found.
+        sample_clock: stores the sample clock; None: it is not stored.
+        store: stores maps; None: they are not stored. start: the map with which the run starts.
+        stream: path of the local stream; None: there is no stream.
     """
 
     clock: Clock

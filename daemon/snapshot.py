@@ -1,4 +1,4 @@
-"""The snapshot: everything that is published of one cycle, immutable."""
+"""The snapshot and its types: everything that is published of one cycle, immutable."""
 
 from __future__ import annotations
 
@@ -7,90 +7,90 @@ from enum import IntEnum
 from typing import Final
 
 UNKNOWN: Final = None
-"""A field that nobody can know yet is None here and the documented "not known" value on the wire."""
+"""Value of a field that is not available; the wire carries the documented "not known" value."""
 
 
 class State(IntEnum):
-    """The published state machine. Numbers are part of the contract: never renumber."""
+    """Published state of localisation. Numbers are part of the contract: never renumber."""
 
-    STARTING = 0  # warming up, nothing to say yet
+    STARTING = 0  # warming up, no pose yet
     NO_LIDAR = 1  # no valid scan for three scan periods, or not steadily again
-    MAPPING = 2  # the pose follows the laser, but no witness has proved it yet
-    TRACKING = 3  # two witnesses agree, or one has proved itself
-    DEGRADED = 4  # the pose is held, at least one axis or witness is missing
-    AMBIGUOUS = 5  # several places fit
-    LOST = 6  # no pose worth using
-    RELOCATING = 7  # looking for the place
+    MAPPING = 2  # the pose follows the lidar, but no other solution has confirmed it yet
+    TRACKING = 3  # two independent solutions agree, or one is confirmed by itself
+    DEGRADED = 4  # the pose is confirmed, but at least one axis or input is missing
+    AMBIGUOUS = 5  # several hypotheses fit
+    LOST = 6  # no usable pose
+    RELOCATING = 7  # searches for the pose in the map
 
 
 GUESSED: Final = (State.LOST, State.RELOCATING, State.AMBIGUOUS)
-"""States in which the place is not known: a pose that is published meanwhile is a guess."""
+"""States without a confirmed position: a pose published in them is unconfirmed."""
 
 
 class LightFix(IntEnum):
-    """How far the position from lights has come (`estimator.result.Fix`). Numbers are part of the contract."""
+    """State of the light solution (`estimator.result.Fix`). Numbers are part of the contract."""
 
     NONE = 0  # no lamps in view, or too few
-    STARTING = 1  # position known, heading and gains still being found
-    GOOD = 2  # position and heading known
-    HELD = 3  # carried on by odometry alone, every link is paused
-    AMBIGUOUS = 4  # several places fit
-    LOST = 5  # what is received contradicts the position: starting anew
+    STARTING = 1  # position available; heading and gains have not converged
+    GOOD = 2  # position and heading available
+    HELD = 3  # predicted by odometry alone, every link is paused
+    AMBIGUOUS = 4  # several hypotheses fit
+    LOST = 5  # the received lamps contradict the position: the light filter restarts
 
 
 class LinkUse(IntEnum):
-    """What a received lamp is used for (`estimator.result.LinkState`). Numbers are part of the contract."""
+    """Use of a received lamp (`estimator.result.LinkState`). Numbers are part of the contract."""
 
-    OTHER = 0  # something that this version does not know
+    OTHER = 0  # a value that this version does not define
     ACCEPTED = 1  # used
-    OCCLUDED = 2  # weaker than it can be here: something stands in its way
-    REJECTED = 3  # stronger than it can be here: moved, exchanged, or its code in use twice
+    OCCLUDED = 2  # weaker than possible at this pose: something obstructs it
+    REJECTED = 3  # stronger than possible at this pose: moved, exchanged, or its code in use twice
     RIM = 4  # at the edge of the field of view
     FAINT = 5  # not above the noise
     TWIN = 6  # two lamps of this code are in view
-    UNSURVEYED = 7  # no lamp of this code is known
-    MISSING = 8  # not received, though it must be here: dead, or covered
+    UNSURVEYED = 7  # the survey has no lamp of this code
+    MISSING = 8  # not received, though expected here: failed or covered
     PAUSED = 9  # clear, but not among those that are used (Link_n)
 
 
 class LoopReason(IntEnum):
-    """Why a loop closure was accepted (`estimator.result.LoopReason`). Numbers are part of the contract."""
+    """Reason for accepting a loop closure (`estimator.result.LoopReason`). Numbers are part of the contract."""
 
-    OTHER = 0  # something that this version does not know
-    NEAR = 1  # laser: the scan fits the map where it was expected
-    SEARCHED = 2  # laser: the scan fits the map in one place of all that were possible
-    SUPPORTED = 3  # laser, twice: two keyframes from different places agree on it
-    LIT = 4  # light and laser: the same lamps are seen from the same place, and the scan fits the map there
-    PLACED = 5  # found in the whole map: the one place that fits all that was seen since the place was lost
+    OTHER = 0  # a value that this version does not define
+    NEAR = 1  # lidar: the scan fits the map at the predicted pose
+    SEARCHED = 2  # lidar: the scan fits the map at only one of all possible poses
+    SUPPORTED = 3  # lidar, twice: two keyframes at different positions agree
+    LIT = 4  # light and lidar: the same lamps are received at the same position, and the scan fits the map there
+    PLACED = 5  # found in the whole map: the one pose that fits all measurements since the pose was lost
 
 
 class Stage(IntEnum):
-    """Parts of a cycle, in the order in which they are published. Numbers are part of the contract: never renumber."""
+    """Stages of a cycle, in the order in which they are published. Numbers are part of the contract: never renumber."""
 
-    BRIDGE = 0  # answers of the worker; devices' readings become SI records
-    LIGHTS = 1  # decoding a block of samples, the filter of lights, odometry up to then
-    SEARCH = 2  # for lamps that are not followed yet
-    MATCH = 3  # the scan against the map, and what comes of it
+    BRIDGE = 0  # job results of the worker; conversion of device readings to SI records
+    LIGHTS = 1  # decoding of a block of samples, light filter, odometry up to that time
+    SEARCH = 2  # acquisition of lamps that are not tracked yet
+    MATCH = 3  # scan match and pose update
     MAP = 4  # keyframes and loops
-    STEP = 5  # what else belongs to the estimate
-    JUDGE = 6  # state, bound, snapshot
+    STEP = 5  # the rest of the estimator step
+    JUDGE = 6  # state, protection level, snapshot
     PUBLISH = 7  # registers, datagrams, stream, recording
-    OUTSIDE = 8  # no cycle was running
+    OUTSIDE = 8  # time between cycles
 
 
 Spread = tuple[int, int, int]
-"""Median, 99 of 100, and largest, microseconds."""
+"""Median, 99th percentile and maximum, us."""
 
 
 @dataclass(frozen=True, slots=True)
 class CycleTiming:
-    """How the cycle itself is doing; None: not known.
+    """Cycle timing; None: not available.
 
     Attributes:
-        rung: what is left out for lack of time, or by a pause (`estimator.measurements.DegradationLevel`).
-        thinned, without_map, carried: cycles on rung 1, 2, 3 since the start.
-        stalls: how often no cycle began in time; stall_s, stall_in: how long the latest lasted, and where.
-        cycle, late: computing time of a cycle, and how late it began. stages: of each of :class:`Stage`, in order.
+        rung: degradation level, by lack of time or by a pause (`estimator.measurements.DegradationLevel`).
+        thinned, without_map, carried: cycles on degradation level 1, 2, 3 since the start.
+        stalls: number of times that no cycle started in time; stall_s, stall_in: duration and stage of the latest.
+        cycle, late: computing time and start delay of a cycle. stages: time of each :class:`Stage`, in order.
     """
 
     rung: int = 0
@@ -106,7 +106,7 @@ class CycleTiming:
 
 
 class Part(IntEnum):
-    """Parts of the daemon that are restarted when they fail. Numbers are part of the contract: never renumber."""
+    """Components of the daemon that are restarted when they fail. Numbers are part of the contract: never renumber."""
 
     LIDAR = 0
     PHOTODIODE = 1
@@ -122,7 +122,7 @@ class Part(IntEnum):
 
 
 class Thread(IntEnum):
-    """Threads of the daemon that are watched. Numbers are part of the contract: never renumber."""
+    """Threads of the daemon with hang detection. Numbers are part of the contract: never renumber."""
 
     SOLVER = 0
     SEARCH = 1
@@ -134,11 +134,11 @@ class Thread(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """How the daemon's parts are.
+    """Health of the daemon's components.
 
     Attributes:
-        uptime_s: seconds since the start. faults: numbers of all that are present, gravest first.
-        restarts: of each of :class:`Part`, in order. down: those that are down. hanging: threads that do not come back.
+        uptime_s: seconds since the start. faults: numbers of all present faults, gravest first.
+        restarts: of each :class:`Part`, in order. down: components that are down. hanging: threads that do not respond.
     """
 
     uptime_s: int = 0
@@ -152,7 +152,7 @@ NO_CONDITION: Final = Condition()
 
 
 LISTED_LINKS: Final = 16
-"""Links that a snapshot lists, the strongest."""
+"""Largest number of links in a snapshot; the strongest are listed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,8 +160,8 @@ class LightLink:
     """One lamp in view.
 
     Attributes:
-        code: as received. lamp_id: None where it is not clear which lamp. use: what it is used for.
-        strength: amplitude of the modulated photocurrent, A. residual: ln(received / expected).
+        code: as received. lamp_id: None where the code does not identify the lamp. use: see :class:`LinkUse`.
+        strength: RSS, A. residual: ln(received / expected).
     """
 
     code: int
@@ -173,13 +173,13 @@ class LightLink:
 
 @dataclass(frozen=True, slots=True)
 class LightPicture:
-    """What lights alone say, without the laser; None: not known.
+    """The light solution, which does not use the lidar's position; None: not available.
 
     Attributes:
-        fix: how far the position has come. used: links it rests on.
+        fix: state of the solution. used: number of links in use.
         t_mono: end of the latest usable block of samples. pose: T_map_base. sigma: of x, y, yaw (m, rad).
-        floor: diffuse light, part of a lamp's own. clock_ppm: error of the sample clock.
-        blocks, blocks_lost: received since the start, and those of them of no use.
+        floor: diffuse floor, as a share of a lamp's own light. clock_ppm: error of the sample clock.
+        blocks, blocks_lost: received since the start, and those of them that are unusable.
         links: strongest first.
     """
 
@@ -197,14 +197,14 @@ class LightPicture:
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """How far the pose can be trusted; None: not known.
+    """Integrity of the pose; None: not available.
 
     Attributes:
-        horizontal_m, yaw_rad: protection level, a bound on the error of the map pose (docs/integrity.md); None: none.
-        limit_m: alert limit that is set; None: none. alert: the bound is above it, or there is none.
-        laser, light, wheels: what the bound rests on.
-        gap: squared Mahalanobis distance between the pose and the one from light alone.
-        places: how many places fit while the place is looked for; None: it is known.
+        horizontal_m, yaw_rad: protection level of the map pose (docs/integrity.md); None: not available.
+        limit_m: alert limit; None: not configured. alert: the protection level exceeds it, or is not available.
+        laser, light, wheels: solutions behind the protection level.
+        gap: squared normalised separation between the published pose and the light solution.
+        places: number of hypotheses during relocalisation; None: no relocalisation.
     """
 
     horizontal_m: float | None = None
@@ -220,26 +220,28 @@ class Trust:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """What is published after one cycle. SI units, `T_map_base` unless said otherwise; None: not known.
+    """Everything that is published after one cycle. SI units, `T_map_base` unless stated otherwise.
+
+    None: not available.
 
     Attributes:
-        seq: counts snapshots. t_mono: instant the pose is true for. t_sent: when this was built. t_utc: `t_sent` as
-            seconds since the Unix epoch.
-        pose: T_map_base (x, y, yaw). odom: T_odom_base. predicted: T_map_base carried to `t_sent` by `velocity`.
-        covariance: (xx, xy, yy, x-yaw, y-yaw, yaw-yaw), m and rad; None while the place in the map is looked for.
+        seq: counts snapshots. t_mono: instant for which the pose is valid. t_sent: instant of building this snapshot.
+            t_utc: `t_sent` as seconds since the Unix epoch.
+        pose: T_map_base (x, y, yaw). odom: T_odom_base. predicted: T_map_base extrapolated to `t_sent` by `velocity`.
+        covariance: (xx, xy, yy, x-yaw, y-yaw, yaw-yaw), m and rad; None during relocalisation.
         velocity: (v_x, v_y, yaw rate) in the base frame.
-        known: (x, y, yaw) whether the axis is observed.
+        known: (x, y, yaw) whether measurements determine the axis.
         reason: index into the table of reasons (daemon/health/reasons.py), 0: none.
-        jumps: how often T_map_odom jumped. map_id: identity of the map frame, 0: not known.
+        jumps: number of jumps of T_map_odom. map_id: identity of the map frame, 0: not available.
         loop_counter: accepted loop closures; loop_new, loop_old: keyframe IDs of the latest, None before the first;
-            loop_reason (:class:`LoopReason`), loop_residual (m): likewise. loop_latched: a loop was closed that
-            nobody has said to have seen.
-        links: lights in view; None where no photodiode is configured. light_id: the strongest's lamp ID.
-        light: what lights alone say; None where no photodiode is configured.
+            loop_reason (:class:`LoopReason`), loop_residual (m): likewise. loop_latched: a loop closure that no client
+            has acknowledged.
+        links: number of lamps in view; None where no photodiode is configured. light_id: lamp ID with the largest RSS.
+        light: the light solution; None where no photodiode is configured.
         scan_rate: scans per second. missed: scans lost. overruns: cycles over budget. cycle_us: last cycle's duration.
         lidar_ok, adc_ok, odometry_ok: None where not configured.
-        fault: number of the gravest present fault, 0: none. trust: how far the pose can be trusted.
-        pulse: how the cycle itself is doing. condition: how the daemon's parts are doing.
+        fault: number of the gravest present fault, 0: none. trust: integrity of the pose.
+        pulse: cycle timing. condition: health of the components.
     """
 
     seq: int

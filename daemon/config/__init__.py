@@ -1,1 +1,1 @@
-"""Files that a person writes: the configuration, the light survey and residual maps."""
+"""User-edited files: the configuration, the lamp survey, and residual maps."""

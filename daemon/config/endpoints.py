@@ -1,4 +1,4 @@
-"""How the configuration writes down where things are: lidars, lines, receivers, networks. Each in one string.
+"""Endpoint syntax of the configuration: lidar device, RTU line, pose receiver and network, one string each.
 
 lidar       auto, auto:H0906091, /dev/ttyACM0, /dev/ttyUSB0@115200, tcp://host:port, none
 RTU line    /dev/ttyUSB1, /dev/ttyUSB1@115200, /dev/ttyUSB1@9600,8N1#17
@@ -17,23 +17,24 @@ from typing import Final
 
 AUTO: Final = "auto"
 NO_DEVICE: Final = "none"
-"""A lidar that is not there: lights alone."""
+"""Device string of a robot without a lidar, which is localised by light alone."""
 ANYBODY: Final = "*"
-"""Host of a receiver that stands for whoever subscribes."""
+"""Host of a receiver that stands for every subscriber."""
 
 SCIP_BAUDS: Final = (19200, 38400, 57600, 115200, 250000, 500000, 750000)
-"""Line rates that SCIP knows (command SS, C-42-03320B)."""
+"""Line rates that SCIP defines (command SS, C-42-03320B), bit/s."""
 RTU_BAUDS: Final = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
 RTU_FORMATS: Final = ("8E1", "8O1", "8N1", "8N2")
 DEFAULT_RTU: Final = (19200, "8E1", 1)
-"""Rate and format that every device has to know (MODBUS over Serial Line V1.02, 2.5.1 and 3.3), and the first unit."""
+"""Rate and format that every device has to support (MODBUS over Serial Line V1.02, 2.5.1 and 3.3), and the first unit.
+"""
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 @dataclass(frozen=True, slots=True)
 class LidarPlace:
-    """Where a lidar is: ``device`` without its rate; ``serial`` to insist on, ``baud`` to use (0: find it)."""
+    """Connection of a lidar: ``device`` without its rate, required ``serial``, ``baud`` in bit/s (0: detect)."""
 
     device: str
     serial: str = ""
@@ -42,7 +43,7 @@ class LidarPlace:
 
 @dataclass(frozen=True, slots=True)
 class RtuLine:
-    """A serial line on which Modbus RTU is served: path, bit/s, character format, our unit address."""
+    """Serial line that serves Modbus RTU: path, bit/s, character format, unit address of this daemon."""
 
     path: str
     baud: int
@@ -54,7 +55,7 @@ def parse_endpoint(text: str) -> tuple[str, int]:
     """Split ``host:port`` or ``[ipv6]:port`` into its parts; the host may be ``*``, or a group ``ff15::42%eth0``.
 
     Raises:
-        ValueError: naming what is wrong and what was expected.
+        ValueError: states what is wrong and what was expected.
     """
     match = re.fullmatch(
         r"(?:\[(?P<v6>[0-9A-Fa-f:.]+(?:%[\w.-]+)?)\]|(?P<host>[A-Za-z0-9_.-]+|\*)):(?P<port>\d{1,5})", text
@@ -74,12 +75,12 @@ def parse_endpoint(text: str) -> tuple[str, int]:
 
 
 def in_url(host: str) -> str:
-    """A host as it stands before the colon of a port: an IPv6 address in brackets."""
+    """Host in URL notation: an IPv6 address in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 def is_address(text: str) -> bool:
-    """Whether this is an IP address."""
+    """Whether the text is an IP address."""
     for family in (socket.AF_INET, socket.AF_INET6):
         try:
             socket.inet_pton(family, text)
@@ -90,10 +91,10 @@ def is_address(text: str) -> bool:
 
 
 def parse_lidar(text: str) -> LidarPlace:
-    """Take a lidar's device string apart; what a driver of its own is to understand is left as it is.
+    """Split a lidar's device string into its parts; the part for a driver outside this project is passed on unchanged.
 
     Raises:
-        ValueError: naming what is wrong and what was expected.
+        ValueError: states what is wrong and what was expected.
     """
     if text.startswith(f"{AUTO}:"):
         serial = text.removeprefix(f"{AUTO}:")
@@ -108,10 +109,10 @@ def parse_lidar(text: str) -> LidarPlace:
 
 
 def parse_line(text: str) -> RtuLine:
-    """Take ``path@rate,format#unit`` apart; rate, format and unit may be left out.
+    """Split ``path@rate,format#unit`` into its parts; rate, format and unit are optional.
 
     Raises:
-        ValueError: naming what is wrong and what was expected.
+        ValueError: states what is wrong and what was expected.
     """
     form = r"(?P<path>/[^@#]+)(?:@(?P<baud>\d+)(?:,(?P<format>\w+))?)?(?:#(?P<unit>\d+))?"
     if (match := re.fullmatch(form, text)) is None:
@@ -128,10 +129,10 @@ def parse_line(text: str) -> RtuLine:
 
 
 def parse_network(text: str) -> Network:
-    """An address or a network of them.
+    """Parse an IP address or a network.
 
     Raises:
-        ValueError: naming what is wrong and what was expected.
+        ValueError: states what is wrong and what was expected.
     """
     try:
         return ipaddress.ip_network(text)
@@ -143,16 +144,16 @@ def parse_network(text: str) -> Network:
 
 
 def subscription_port(receivers: Sequence[str]) -> int:
-    """Port on which whoever subscribes gets pose datagrams; 0: none."""
+    """Port on which subscribers receive pose datagrams; 0: none."""
     return next((port for host, port in map(parse_endpoint, receivers) if host == ANYBODY), 0)
 
 
 def interface_of(bind: str) -> str:
-    """The network that `bind` names, for datagrams to groups; empty: none of its own (all, loopback, IPv6)."""
+    """Network interface address in `bind` for multicast datagrams; empty for all addresses, loopback and IPv6."""
     address = ipaddress.ip_address(bind)
     return bind if address.version == 4 and not address.is_unspecified and not address.is_loopback else ""
 
 
 def is_bus(device: str) -> bool:
-    """Whether this is the name of an I2C bus; ``tcp://`` names a lidar here, so such a bus is named ``i2c+tcp://``."""
+    """Whether the text names an I2C bus. ``tcp://`` names a lidar here, so a remote bus is ``i2c+tcp://``."""
     return re.match(r"/dev/i2c-|adapter:|unix:|i2c\+tcp://", device) is not None

@@ -1,7 +1,7 @@
-"""What is known of the keys of the configuration, and what is wrong with one, in words for who writes it.
+"""Readable messages for errors in the configuration, and the descriptions of its keys.
 
-Each problem names the file, the line, the key, what was found, what is allowed, what the key is for and an example; an
-unknown key names the nearest known one.
+Each message names the file, the line, the key and the value found. It states the values allowed, the purpose of the key
+and an example. For an unknown key it names the nearest valid one.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ MOVED: Final = {
     "lidar.baud": 'write the rate behind the path, as in lidar.device = "/dev/ttyUSB0@115200", or leave it out: it is '
     "found by itself",
 }
-"""Keys of earlier versions, and what to write instead."""
+"""Keys of earlier versions, and their present replacement."""
 LONGEST: Final = 60
-"""Characters of a value that are repeated."""
+"""Characters of a value that a message repeats."""
 UNKNOWN: Final = re.compile(r"contains unknown field `(.*)`$", re.DOTALL)
-"""How the library names a key that it does not know."""
+"""Message by which msgspec names an unknown key."""
 
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """One key of the tree, as people need to know it; ``example``: a value that means something."""
+    """Description of one configuration key for users; ``example``: a useful value."""
 
     path: str
     kind: str
@@ -44,9 +44,9 @@ class Option:
 
 @dataclass(frozen=True, slots=True)
 class _Problem:
-    """What is wrong: ``keys`` lead to it through the tree, empty where it is not one key; ``words`` say it.
+    """One error: ``keys`` is the path in the tree, empty where it concerns no single key; ``words`` is the message.
 
-    ``beside``: what names the other keys that it is about. ``item``: which one of a list it is; None: all of it.
+    ``beside``: text that names the other keys concerned. ``item``: index in a list; None: the whole value.
     """
 
     keys: tuple[str, ...]
@@ -57,15 +57,15 @@ class _Problem:
 
 @dataclass(frozen=True, slots=True)
 class Wrong:
-    """One thing that is wrong: the line that says it, and the key (empty where it is not one)."""
+    """One error of the configuration: the message line, and the key (empty where it concerns no single key)."""
 
     text: str
     path: str
 
 
 def options(tree: type[msgspec.Struct] = Config) -> list[Option]:
-    """Every option of a tree in order of declaration."""
-    from msgspec import inspect  # costs 10 ms, and only explanations need it
+    """All options of a configuration tree in order of declaration."""
+    from msgspec import inspect  # takes 10 ms, and only messages need it
 
     kind = inspect.type_info(tree)
     assert isinstance(kind, inspect.StructType)
@@ -73,19 +73,21 @@ def options(tree: type[msgspec.Struct] = Config) -> list[Option]:
 
 
 def problems(tree: dict[str, Any], name: str, text: str = "") -> list[Wrong]:
-    """Everything that is wrong with a tree; what is wrong is taken out, so that the rest can be judged.
+    """Find all errors of a tree; each wrong value is removed from it, so that the rest can be checked.
 
     Args:
-        tree: as TOML holds it; good afterwards, where each problem is that of one key.
-        name: of the file or the option that it comes from.
-        text: of that file, for the numbers of lines.
+        tree: as TOML holds it; valid afterwards, where each error concerns a single key.
+        name: of the file or the option that the tree comes from.
+        text: of that file, for line numbers.
     """
     found: list[tuple[int, Wrong]] = []
     gone: list[str] = []
 
     def tell(problem: _Problem) -> None:
         path = ".".join(problem.keys)
-        if not any(f"`{key}`" in problem.beside for key in gone):  # else it is about the value that stands in for that
+        if not any(
+            f"`{key}`" in problem.beside for key in gone
+        ):  # otherwise the error concerns the default that replaces the removed value
             line = line_of(text, path)
             found.append((line, Wrong(f"{name}:{line}: {problem.words}" if line else f"{name}: {problem.words}", path)))
         gone.append(path)
@@ -102,7 +104,7 @@ def problems(tree: dict[str, Any], name: str, text: str = "") -> list[Wrong]:
 
 
 def _first(tree: dict[str, Any]) -> _Problem | None:
-    """What is found wrong first; None where the tree is good."""
+    """First error of the tree; None where the tree is valid."""
     try:
         msgspec.convert(tree, Config)
     except msgspec.ValidationError as error:
@@ -111,7 +113,10 @@ def _first(tree: dict[str, Any]) -> _Problem | None:
 
 
 def _take_out(tree: dict[str, Any], problem: _Problem) -> bool:
-    """Whether there was such a key; of a list the other items stay, beside the example's first."""
+    """Remove the wrong key, or the wrong item of a list; returns whether the key existed.
+
+    The other items of a list stay, with those of the example in front.
+    """
     for key in problem.keys[:-1]:
         tree = tree.get(key, {})
     if not problem.keys or (value := tree.pop(problem.keys[-1], None)) is None:
@@ -123,7 +128,10 @@ def _take_out(tree: dict[str, Any], problem: _Problem) -> bool:
 
 
 def _nul(tree: dict[str, Any], parents: tuple[str, ...]) -> Iterator[_Problem]:
-    """TOML can write the character that ends a name for the operating system; no path or address has it."""
+    """Errors for values with a NUL character.
+
+    TOML can write it, but it ends a name for the operating system. No path or address contains it.
+    """
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from _nul(value, (*parents, key))
@@ -133,9 +141,9 @@ def _nul(tree: dict[str, Any], parents: tuple[str, ...]) -> Iterator[_Problem]:
 
 
 def _explain(message: str, tree: dict[str, Any]) -> _Problem:
-    """What the library says, or a check of `daemon.config.schema`, in words for who writes the file."""
+    """Turn a message of msgspec, or of a check in `daemon.config.schema`, into a readable error."""
     whole = UNKNOWN.search(message)
-    named = whole is not None and whole[1] in tree  # a key of the root may look as if it named a place, too
+    named = whole is not None and whole[1] in tree  # a key of the root may look like a path
     at = None if named else re.search(r" - at `\$\.?([^`]*)`$", message)
     place, message = (at[1], message[: at.start()]) if at else ("", message)
     keys = _keys(place)
@@ -162,31 +170,31 @@ def _explain(message: str, tree: dict[str, Any]) -> _Problem:
 
 
 def _keys(place: str) -> tuple[str, ...]:
-    """Keys of a place without what counts items of lists."""
+    """Keys on a path, without list indices."""
     return tuple(re.sub(r"\[\d+\]", "", place).split(".")) if place else ()
 
 
 def _item(place: str) -> int | None:
-    """Which item of a list a place is in."""
+    """List index of a path; None without one."""
     number = re.search(r"\[(\d+)\]", place)
     return None if number is None else int(number[1])
 
 
 def _value(tree: Any, place: str) -> Any:
-    """What the tree holds at a place such as ``lidar.mask.sectors[1]``."""
+    """Value at a path such as ``lidar.mask.sectors[1]``."""
     for key, number in re.findall(r"([^.\[\]]+)|\[(\d+)\]", place):
         tree = tree[int(number)] if number else tree[key]
     return tree
 
 
 def wrong_value(place: str, value: object, option: Option) -> str:
-    """What is said of a value that its key cannot have: what was found, what is allowed, what it is for, an example."""
+    """Message for a wrong value: the value found, the values allowed, the purpose of the key, an example."""
     expected = re.sub("^(?=whole|number|list)", "a ", _kind_at(place, option.kind))
     return f"`{place}` = {_found(value)}: expected {expected}{_purpose(option)}"
 
 
 def _kind_at(place: str, kind: str) -> str:
-    """What is allowed at a place: of an item of a list, ``sectors[1][0]``, what is allowed of that."""
+    """Allowed values at a path; for a list item such as ``sectors[1][0]``, those of the item."""
     for number in re.findall(r"\[(\d+)\]", place):
         if items := re.fullmatch(r"\[(.*)\](?:, each (.*))?", kind):
             kind = items[1].split(", ")[int(number)] + (f", {items[2]}" if items[2] else "")
@@ -206,12 +214,12 @@ def _purpose(option: Option) -> str:
 
 
 def written(keys: tuple[str, ...]) -> str:
-    """A key as TOML writes it: quotes show that a dot within them divides nothing."""
+    """A key in TOML notation; quotes mark a dot inside a key, which separates nothing."""
     return ".".join(key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else value_text(key) for key in keys)
 
 
 def _nearest(path: str, table: bool) -> str:
-    """What may be meant by an unknown key; ``table``: it holds others."""
+    """Nearest valid key to an unknown one; ``table``: the key holds others."""
     values = [option.path for option in options()]
     tables = sorted({path[: dot.start()] for path in values for dot in re.finditer(r"\.", path)})
     if path in values or path in tables:
@@ -226,7 +234,7 @@ def _nearest(path: str, table: bool) -> str:
 
 
 def line_of(text: str, path: str) -> int:
-    """Line of the assignment that holds the key at ``path``, or of its table; 0 where neither is written out."""
+    """Line number of the assignment of the key at ``path``, or of its table; 0 where the text contains neither."""
     table = ""
     best, best_length = 0, 0
     for number, line in enumerate(text.splitlines(), 1):
@@ -260,10 +268,10 @@ def _walk(kind: inspect.StructType, prefix: str) -> Iterator[Option]:
 
 
 def _told(kind: inspect.Type) -> dict[str, Any]:
-    """What the tree says of a key."""
+    """Extra JSON schema entries of a key (description, examples), from its type annotation."""
     from msgspec import inspect
 
-    if isinstance(kind, inspect.UnionType):  # of something, or nothing
+    if isinstance(kind, inspect.UnionType):  # an optional type
         return _told(kind.types[0])
     return dict(kind.extra_json_schema or {}) if isinstance(kind, inspect.Metadata) else {}
 
@@ -291,7 +299,7 @@ def _kind(kind: inspect.Type) -> str:
 
 
 def value_text(value: object) -> str:
-    """A value of the tree as TOML writes it."""
+    """A value of the tree in TOML notation."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, (int, float)):
@@ -300,5 +308,5 @@ def value_text(value: object) -> str:
         return "[" + ", ".join(value_text(item) for item in value) + "]"
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{written((key,))} = {value_text(item)}" for key, item in value.items()) + " }"
-    # a JSON string is a TOML basic string, except that TOML wants DEL escaped too
+    # a JSON string is a TOML basic string, except that TOML also requires an escaped DEL
     return msgspec.json.encode(value).decode().replace("\x7f", "\\u007F")

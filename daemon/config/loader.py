@@ -1,7 +1,7 @@
-"""Reads, explains and prints the configuration tree.
+"""Configuration loader: reads TOML files and overrides, checks them, and prints the resolved tree or its reference.
 
-All errors are told at once (`daemon/config/errors.py` has the words). What is printed (``--print-config``, the
-reference in the documentation) can be pasted back.
+All errors are reported at once (`daemon/config/errors.py` has the messages). Printed output (``--print-config``, the
+reference in the documentation) can be read again as a configuration.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ All keys with their defaults, ready to paste:
 
 
 class ConfigError(Exception):
-    """The configuration cannot be used; each line of the text says where, what was expected and what to do.
+    """The configuration cannot be used; each line of the text states where, what was expected and the remedy.
 
     Attributes:
-        rest: the configuration without what is wrong; None: nothing is left that could be judged.
-        wrong: the keys that are.
+        rest: the configuration without the wrong keys; None: no part can be checked further.
+        wrong: the wrong keys.
     """
 
     def __init__(self, text: str, rest: Config | None = None, wrong: frozenset[str] = frozenset()) -> None:
@@ -65,7 +65,7 @@ class ConfigError(Exception):
 
 
 def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
-    """Read a file (None: defaults only), lay ``KEY=VALUE`` overrides over it, and check the result.
+    """Read a file (None: defaults only), apply ``KEY=VALUE`` overrides, and check the result.
 
     Raises:
         ConfigError: unreadable, not TOML, unknown keys, or wrong values; all of them, a line each.
@@ -96,14 +96,14 @@ def _rest(tree: dict[str, Any], file: Path | None) -> Config | None:
     try:
         return _anchored(msgspec.convert(tree, Config), file)
     except msgspec.ValidationError:
-        return None  # what is wrong is not one key, which could be left out
+        return None  # an error that concerns no single key cannot be removed
 
 
 def _anchored(config: Config, file: Path | None) -> Config:
-    """The same with paths as seen from the configuration file, not from wherever the process runs."""
+    """The configuration with relative paths resolved from the configuration file, not the working directory."""
     if file is None:
         return config
-    here = file.resolve().parent  # an absolute path stays what it is
+    here = file.resolve().parent  # an absolute path stays as it is
     if config.lights.survey:
         lights = msgspec.structs.replace(config.lights, survey=str(here / config.lights.survey))
         config = msgspec.structs.replace(config, lights=lights)
@@ -115,7 +115,7 @@ def _anchored(config: Config, file: Path | None) -> Config:
 
 
 def naming(file: Path | None, key: str, path: Path) -> str:
-    """Who names a file that is wrong: ``FILE:LINE`` and the key; the key alone where ``--set`` names it."""
+    """Source of a wrong file name: ``FILE:LINE`` and the key; the key alone where ``--set`` gives it."""
     try:
         text = file.read_text("utf-8") if file is not None else ""
         told: Any = tomllib.loads(text)
@@ -124,12 +124,12 @@ def naming(file: Path | None, key: str, path: Path) -> str:
         if file is not None and (file.resolve().parent / told) == path and (line := line_of(text, key)):
             return f"{file}:{line} names it: `{key}`"
     except (OSError, ValueError, KeyError, TypeError):
-        pass  # what is wrong with the configuration itself is told elsewhere
+        pass  # errors of the configuration itself are reported elsewhere
     return f"`{key}` names it"
 
 
 def brought_up(tree: dict[str, Any]) -> dict[str, Any]:
-    """The resolved tree of an earlier version, as recordings hold it, in the keys of this one."""
+    """Convert the resolved tree of an earlier version, as stored in recordings, to the present keys."""
     lidar = dict(tree.get("lidar", {}))
     serial, baud = lidar.pop("serial", ""), lidar.pop("baud", 0)
     device = lidar.get("device", AUTO)
@@ -148,16 +148,16 @@ def dump(config: Config) -> str:
 
 
 def write(path: Path, config: Config, notes: Sequence[str] = (), force: bool = False) -> None:
-    """Write the whole resolved tree as a file, whole or not at all; `load` reads it back as an equal tree.
+    """Write the whole resolved tree to a file, atomically; `load` reads it back as an equal tree.
 
     Args:
-        path: where to.
-        config: what.
+        path: of the file.
+        config: the configuration.
         notes: lines of comment at the head.
-        force: replace a file that is there.
+        force: replace an existing file.
 
     Raises:
-        ConfigError: there is such a file already, or it cannot be written.
+        ConfigError: the file exists already, or it cannot be written.
     """
     refuse_overwriting(path, force)
     head = "".join(f"# {note}".rstrip() + "\n" for note in notes)
@@ -168,7 +168,7 @@ def write(path: Path, config: Config, notes: Sequence[str] = (), force: bool = F
 
 
 def refuse_overwriting(path: Path, force: bool) -> None:
-    """Raises `ConfigError` where there is a file that nobody asked to be replaced."""
+    """Raise `ConfigError` where the file exists and ``force`` is not set."""
     if path.exists() and not force:
         raise ConfigError(f"{path} exists: name another file with --out, or ask for it to be replaced with --force")
 
@@ -179,7 +179,7 @@ def schema() -> str:
 
 
 def reference() -> str:
-    """The documentation page: every key with its meaning, its range and its default."""
+    """The reference page of the configuration: every key with its meaning, its range and its default."""
     lines: list[str] = []
     table = ""
     for option in options():
@@ -209,7 +209,7 @@ def _lay_over(tree: dict[str, Any], override: str) -> None:
     try:
         value: object = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
-        value = text  # a bare word is a string, so that a shell needs no second quotes
+        value = text  # an unquoted word is a string, so that a shell needs no second pair of quotes
     *parents, key = path.strip().split(".")
     for parent in parents:
         child = tree.setdefault(parent, {})

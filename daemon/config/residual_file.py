@@ -1,7 +1,7 @@
-"""Residual maps as files beside the survey: arrays with a version, a checksum, and the survey they belong to.
+"""Residual map file beside the survey: versioned arrays with a checksum and the digest of their survey.
 
-``lights.toml`` has its map in ``lights.residuals.npz``. A map is only good with the survey it was learned with; one
-that does not belong to it, is damaged, or is of another version is refused by name and the robot drives without.
+``lights.toml`` has its map in ``lights.residuals.npz``. A map is valid only with the survey it was learned with. A map
+of another survey or version, or a damaged one, is rejected with its name; the robot then drives without it.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ _DAMAGE: Final = (
     *(OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError, MemoryError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
-"""What zip and numpy raise for bytes that are not what they should be."""
+"""Exceptions of zipfile and numpy for damaged content."""
 _ARRAYS: Final = ("lamp_ids", "grid", "mean", "sigma", "noise")
 
 
 class ResidualError(Exception):
-    """The map cannot be used or written; the text says why and what to do."""
+    """The map cannot be used or written; the text states the reason and the remedy."""
 
 
 def write_residuals(path: Path, residuals: ResidualMap, survey: Survey) -> None:
-    """Write a map whole or not at all; raises `ResidualError`."""
+    """Write a map atomically; raises `ResidualError`."""
     arrays = {
         "lamp_ids": np.array(residuals.lamp_ids, dtype=np.int64),
         "grid": residuals.grid,
@@ -52,7 +52,7 @@ def write_residuals(path: Path, residuals: ResidualMap, survey: Survey) -> None:
 
 
 def read_residuals(path: Path, survey: Survey) -> ResidualMap | None:
-    """The map beside a survey; None where there is none.
+    """Read the residual map beside a survey; None where there is none.
 
     Raises:
         ResidualError: damaged, of another version, or learned with another survey.
@@ -67,13 +67,13 @@ def read_residuals(path: Path, survey: Survey) -> ResidualMap | None:
 
 
 def unpack(content: bytes, survey: Survey, path: str) -> ResidualMap:
-    """A map from a file's content; ``path`` names it in errors.
+    """Decode a residual map from a file's content; ``path`` names it in errors.
 
     Raises:
         ResidualError: see :func:`read_residuals`.
     """
     try:
-        # numpy leaves a file open that it cannot make sense of
+        # numpy does not close a file that it cannot parse
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             kept = {name: file[name] for name in (*_ARRAYS, "version", "survey", "check")}
     except _DAMAGE as error:
@@ -93,7 +93,7 @@ _AGAIN: Final = "delete it, or calibrate again"
 
 
 def digest(survey: Survey) -> str:
-    """Of what the survey says, comments and layout apart."""
+    """Digest of a survey's values, without comments and layout."""
     return hashlib.sha256(dump(survey).encode()).hexdigest()
 
 

@@ -1,7 +1,7 @@
-"""The one configuration tree: typed, every key with a default, a range and a description.
+"""Configuration schema: one typed tree in which every key has a default, a range and a description.
 
-Few options on purpose (a test holds them to 25): what a device states about itself is not an option. This module is
-the tree alone; ``daemon/config/loader.py`` reads, explains and prints it.
+There are few options on purpose (a test limits them to 25): a property that a device reports itself is not an option.
+This module contains the tree alone; ``daemon/config/loader.py`` reads, explains and prints it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from daemon.config.endpoints import (
 )
 
 PROFILES = ("A", "B", "D")
-"""Air interfaces (docs/air-interface.md)."""
+"""Air interface profiles (docs/air-interface.md)."""
 
 Port = Annotated[int, Meta(ge=0, le=65535)]
 Metres = Annotated[float, Meta(ge=-100.0, le=100.0)]
@@ -35,7 +35,7 @@ Degrees = Annotated[float, Meta(ge=-360.0, le=360.0)]
 
 
 def _check_network(key: str, name: str, parse: Callable[[str], object]) -> None:
-    """Raise ValueError for a ``tcp://`` name that cannot be opened; a port may be left out, each kind has its own."""
+    """Raise ValueError for a ``tcp://`` name that cannot be opened; the port is optional, with a default by kind."""
     from hal.errors import DeviceRefused
 
     try:
@@ -45,7 +45,7 @@ def _check_network(key: str, name: str, parse: Callable[[str], object]) -> None:
 
 
 def _named(key: str, parse: Callable[[str], object], text: str) -> None:
-    """Raise what ``parse`` raises, with the key in it."""
+    """Raise the ValueError of ``parse`` with the key added."""
     try:
         parse(text)
     except ValueError as error:
@@ -108,12 +108,12 @@ class LidarConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     @property
     def place(self) -> LidarPlace:
-        """The device string's parts."""
+        """Parts of the device string."""
         return parse_lidar(self.device)
 
     @property
     def fitted(self) -> bool:
-        """Whether there is a lidar."""
+        """Whether the robot has a lidar."""
         return self.device != NO_DEVICE
 
 
@@ -121,7 +121,7 @@ def parse_chip(text: str) -> tuple[str, int, int | None]:
     """Split ``chip@address`` or ``chip@address/channel`` into its parts; the channel is None where there is none.
 
     Raises:
-        ValueError: naming what is wrong and what was expected.
+        ValueError: states what is wrong and what was expected.
     """
     match = re.fullmatch(r"(?P<chip>\w+)@(?P<address>0[xX][0-9A-Fa-f]{1,2}|\d{1,3})(?:/(?P<channel>\d))?", text)
     if match is None:
@@ -190,7 +190,7 @@ class PhotodiodeConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     @property
     def fitted(self) -> bool:
-        """Whether there is a photodiode."""
+        """Whether the robot has a photodiode."""
         return bool(self.bus)
 
 
@@ -207,7 +207,7 @@ class LightsConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 
 NO_FOLDER = "none"
-"""A map folder that is not there: maps end with the process."""
+"""Map folder value by which no map is stored: maps end with the process."""
 
 
 class MapConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -230,7 +230,7 @@ class MapConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     @property
     def kept(self) -> bool:
-        """Whether maps are kept at all."""
+        """Whether maps are stored at all."""
         return self.folder != NO_FOLDER
 
 
@@ -270,7 +270,7 @@ class ModbusConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     @property
     def line(self) -> RtuLine | None:
-        """The serial line; None: none."""
+        """The serial line of Modbus RTU; None: none."""
         return parse_line(self.serial) if self.serial else None
 
 

@@ -1,7 +1,7 @@
-"""What is wrong with a light survey, all of it at once, in words for who writes the file.
+"""Readable messages for errors in a lamp survey, all of them at once.
 
-Each problem names the file, the line, the lamp, the key, what was found, what is allowed, what the key is for and an
-example; an unknown key names the nearest known one.
+Each message names the file, the line, the lamp, the key and the value found. It states the values allowed, the purpose
+of the key and an example. For an unknown key it names the nearest valid one.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from daemon.config.survey_schema import LampEntry, ReceiverEntry, SurveyTree, la
 from estimator import Profile
 
 NEAREST_M: Final = 0.01
-"""Two lamps closer than this are one lamp written twice."""
+"""Distance in m below which two lamps are one lamp written twice."""
 HEADROOM_M: Final = 0.2
-"""Least height of a lamp above the receiver."""
+"""Smallest height of a lamp above the receiver, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """One table of the file: what is ``wrong`` with it (key, or empty; words), and the ``good`` values by key."""
+    """Check result of one table: its errors ``wrong`` (key or empty; message), and the valid values ``good`` by key."""
 
     wrong: list[tuple[str, str]]
     good: dict[str, Any]
 
     def has(self, *keys: str) -> bool:
-        """Whether these can be compared with those of others."""
+        """Whether all these keys are valid, so that they can be compared with those of others."""
         return self.good.keys() >= set(keys)
 
 
 def problems(tree: dict[str, Any], name: str, text: str, profile: Profile | None = None) -> list[str]:
-    """Everything that is wrong with a survey, a line each, in the order of the file.
+    """All errors of a survey, a line each, in the order of the file.
 
     Args:
         tree: as TOML holds it.
         name: of the file.
-        text: of it, for the numbers of lines.
-        profile: air interface the lamps have to have; None: any.
+        text: of the file, for line numbers.
+        profile: air interface that the lamps must have; None: any.
     """
     lines = _Lines(text)
     lamps, receiver = tree.get("lamp"), tree.get("receiver")
     listed = lamps if isinstance(lamps, list) else []
     judged = [_judge(lamp, LampEntry) for lamp in listed]
     eye = _judge({} if receiver is None else receiver, ReceiverEntry)
-    sound: dict[str, Any] = {}  # what is in them is told by itself
+    sound: dict[str, Any] = {}  # errors inside them are reported separately
     if isinstance(lamps, list):
         sound["lamp"] = [_stand_ins(LampEntry)] * bool(lamps)
     if receiver is not None:
@@ -71,11 +71,11 @@ def _named(lamp: _Judged, at: int) -> str:
 
 
 def _judge(table: object, kind: type[msgspec.Struct]) -> _Judged:
-    """Every key by itself, then what the table's own check says of the good ones."""
+    """Check every key by itself, then run the table's own check on the valid ones."""
     try:
         return _Judged([], msgspec.structs.asdict(msgspec.convert(table, kind)))
     except msgspec.ValidationError:
-        pass  # it names the first that is wrong; all are wanted
+        pass  # this check names the first error only; all are wanted
     if not isinstance(table, dict):
         return _Judged([("", f"expected a table, {{ ... }}, of {', '.join(kind.__struct_fields__)}")], {})
     known = _known(kind)
@@ -94,7 +94,7 @@ def _judge(table: object, kind: type[msgspec.Struct]) -> _Judged:
 
 
 def _wrong(table: dict[str, Any], field: msgspec.structs.FieldInfo, option: Option) -> str:
-    """What is wrong with one key; empty: nothing."""
+    """Error message for one key; empty: valid."""
     if field.name not in table:
         said = f"`{field.name}` is missing: {option.description}; as in {field.name} = {value_text(option.example)}"
         return said if field.required else ""
@@ -111,7 +111,7 @@ def _known(kind: type[msgspec.Struct]) -> dict[str, Option]:
 
 
 def _stand_ins(kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """A table that is good, of what it must have."""
+    """A valid table with the required keys only."""
     known = _known(kind)
     return {field.name: known[field.name].example for field in msgspec.structs.fields(kind) if field.required}
 
@@ -123,7 +123,7 @@ def _nearest(key: str, kind: type[msgspec.Struct]) -> str:
 
 
 def _numbers(lamps: list[_Judged], lines: _Lines) -> list[tuple[int, str]]:
-    """Lamps whose number another has."""
+    """Errors for lamps with the number of another lamp."""
     found, seen = [], dict[int, int]()
     for at, lamp in enumerate(lamps):
         if lamp.has("lamp_id") and (number := lamp.good["lamp_id"]) in seen:
@@ -135,7 +135,7 @@ def _numbers(lamps: list[_Judged], lines: _Lines) -> list[tuple[int, str]]:
 
 
 def _places(lamps: list[_Judged], eye: _Judged, lines: _Lines) -> list[tuple[int, str]]:
-    """Lamps that hang where none can, or another does."""
+    """Errors for lamps at an impossible position, or at that of another lamp."""
     found, hung = [], list[tuple[int, _Judged]]()
     for at, lamp in enumerate(lamps):
         if lamp.has("z") and eye.has("z") and lamp.good["z"] < eye.good["z"] + HEADROOM_M:
@@ -160,7 +160,7 @@ def _by_line(line: int) -> str:
 
 
 def _codes(lamps: list[_Judged], lines: _Lines, profile: Profile) -> list[tuple[int, str]]:
-    """Lamps whose code the profile does not have."""
+    """Errors for lamps whose code does not exist in the profile."""
     return [
         (
             lines.of("code", at),
@@ -173,7 +173,7 @@ def _codes(lamps: list[_Judged], lines: _Lines, profile: Profile) -> list[tuple[
 
 
 class _Lines:
-    """Where in the text of a survey its tables and keys are, counted from 1; 0: nowhere to be found."""
+    """Line numbers of tables and keys in the text of a survey, from 1; 0: not found."""
 
     def __init__(self, text: str) -> None:
         self._lines = [line.partition("#")[0] for line in text.splitlines()]
@@ -184,7 +184,7 @@ class _Lines:
             self._lamps = [at for at in self._matching(r"[^{]*\{") if first <= at < self._after(first)]
 
     def of(self, key: str, lamp: int | None = None, table: str = "") -> int:
-        """Line of a key of a lamp, of a table, or of the root; of the lamp or the table where it has none itself."""
+        """Line of a key of a lamp, of a table, or of the root; if the key has none, that of the lamp or table."""
         first, last = self._span(lamp, table)
         form = re.compile(rf"\s*{re.escape(key)}\s*=")
         own = next((at for at in range(first, last) if key and form.match(self._lines[at])), None)
@@ -196,12 +196,12 @@ class _Lines:
         return [at for at, line in enumerate(self._lines) if re.match(form, line)]
 
     def _after(self, first: int) -> int:
-        """The line after the last one of the value that begins in a line: the next key, or table."""
+        """Line after the value that starts in a line: the next key or table."""
         later = self._matching(r"\s*(\w+\s*=|\[\s*\w+\s*\])")
         return next((at for at in later if at > first), len(self._lines))
 
     def _span(self, lamp: int | None, table: str) -> tuple[int, int]:
-        """Lines of a lamp or of a table: the first, and the one after the last; an empty span where there is none."""
+        """Lines of a lamp or table: the first, and the one after the last; an empty span where it does not exist."""
         end = len(self._lines)
         if lamp is None:
             begins = self._matching(rf"\s*(\[\s*{table}\s*\]|{table}\s*=)") if table else [0]

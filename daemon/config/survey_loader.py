@@ -1,9 +1,9 @@
-"""The light survey: which lamps hang where and how they shine, and the receiver they were calibrated with, as TOML.
+"""Lamp survey file (TOML): lamps with positions and light model, and the receiver they were calibrated with.
 
-A lamp is one line; whatever calibration and survey commands write can be read, edited and written again. Reading is
-strict: an unknown key, a number that no lamp has, or two lamps with one number are refused, all at once, each with the
-file, the line, the key and what was expected. The frame is the survey's, which becomes the map frame
-(docs/calibration.md).
+A lamp is one line. Files that the calibration and survey commands write can be read, edited and written again.
+Reading is strict: an unknown key, a lamp without a number or two lamps with one number are errors. All errors are
+reported at once, each with the file, the line, the key and what was expected.
+The survey's frame becomes the map frame (docs/calibration.md).
 """
 
 from __future__ import annotations
@@ -25,20 +25,21 @@ DECIMALS: Final = 6
 
 
 class SurveyError(Exception):
-    """The survey cannot be used or written; the text says where, what was expected and what to do."""
+    """The survey cannot be used or written; the text states where, what was expected and the remedy."""
 
 
 def residuals_beside(survey: Path) -> Path:
-    """Where a survey's residual map lies (daemon/config/residual_file.py), if it has one."""
+    """Path of the residual map that belongs to a survey (daemon/config/residual_file.py), whether it exists or not."""
     return survey.with_suffix(".residuals.npz")
 
 
 def read_survey(path: Path, profile: Profile | None = None) -> Survey:
-    """Read a survey.
+    """Read and check a survey.
 
     Args:
         path: of the file.
-        profile: air interface the lamps have to have; None: any, and depth is profile A's where the file says none.
+        profile: air interface that the lamps must have; None: any, with the modulation depth of profile A where the
+            file contains none.
 
     Raises:
         SurveyError: missing, unreadable, not TOML, an unknown key, a wrong or implausible value, a lamp twice, a code
@@ -57,17 +58,17 @@ def read_survey(path: Path, profile: Profile | None = None) -> Survey:
 def write_survey(
     path: Path, survey: Survey, notes: Sequence[str] = (), remarks: Mapping[int, str] | None = None, force: bool = False
 ) -> None:
-    """Write a survey whole or not at all, synced to the disk; reading it back yields an equal one (to 1e-6).
+    """Write a survey atomically and sync it to the disk; reading it back yields an equal one (to 1e-6).
 
     Args:
-        path: where to.
-        survey: what.
+        path: of the file.
+        survey: the survey.
         notes: lines of comment at the head.
         remarks: comment behind a lamp, by lamp ID.
-        force: replace a file that is there.
+        force: replace an existing file.
 
     Raises:
-        SurveyError: there is such a file already, or it cannot be written.
+        SurveyError: the file exists already, or it cannot be written.
     """
     if path.exists() and not force:
         raise SurveyError(f"{path} exists: name another file, or ask for it to be replaced with --force")

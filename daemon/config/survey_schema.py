@@ -1,7 +1,7 @@
-"""What a light survey holds, as its file writes it: typed, every key with a range, a description and an example.
+"""Lamp survey schema: the typed file tree, in which every key has a range, a description and an example.
 
-This module is the tree alone; ``daemon/config/survey_loader.py`` reads and writes it,
-``daemon/config/survey_errors.py`` says what is wrong with one.
+This module contains the tree alone. ``daemon/config/survey_loader.py`` reads and writes it;
+``daemon/config/survey_errors.py`` has the error messages.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ _SURVEY: Final = Survey()
 
 
 def last_code(profile: Profile) -> int:
-    """The highest code number of an air interface; the lowest is 0 (`estimator.cdma.gold_codes`)."""
+    """Highest code number of an air interface; the lowest is 0 (`estimator.cdma.gold_codes`)."""
     return profile.length + 1
 
 
 _LAST_CODE: Final = max(map(last_code, PROFILES.values()))
-"""Of any: which of them a file is for is said elsewhere."""
+"""Highest code number of all air interfaces; the limit of a file's own profile is checked elsewhere."""
 
 
 class LampEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """One lamp as the file has it."""
+    """One lamp as stored in the file."""
 
     lamp_id: Annotated[
         int, Meta(ge=0, le=65535, description="the lamp's number in the building, unique", examples=[10])
@@ -62,7 +62,7 @@ class LampEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
             raise ValueError("Expected `order` or `half_angle_deg`, got both")
 
     def lamp(self) -> Lamp:
-        """As the estimator takes it."""
+        """The lamp as an estimator type."""
         order = _LAMP.order if self.order is None else self.order
         if self.half_angle_deg is not None:
             order = order_of(self.half_angle_deg)
@@ -71,7 +71,7 @@ class LampEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 
 class ReceiverEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """The photodiode as the file has it."""
+    """The photodiode as stored in the file."""
 
     x: Annotated[float, Meta(ge=-5.0, le=5.0, description="metres ahead of the robot's centre")] = _RECEIVER.x
     y: Annotated[float, Meta(ge=-5.0, le=5.0, description="metres to the left of the robot's centre")] = _RECEIVER.y
@@ -86,14 +86,14 @@ class ReceiverEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     slope_y: Annotated[Slope, Meta(description="lean of its axis to the left, metres per metre up")] = 0.0
 
     def receiver(self) -> Receiver:
-        """As the estimator takes it."""
+        """The receiver as an estimator type."""
         area, half_fov = round(1e-4 * self.area_cm2, 12), math.radians(self.half_fov_deg)
         arm = (self.x, self.y, self.z)
         return Receiver(*arm, area, self.responsivity, self.order, half_fov, self.slope_x, self.slope_y)
 
 
 class SurveyTree(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """The whole file."""
+    """The whole survey file."""
 
     lamp: Annotated[
         tuple[LampEntry, ...],
@@ -122,11 +122,11 @@ class SurveyTree(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     @property
     def eye(self) -> ReceiverEntry:
-        """The receiver, a plain one where the file does not say."""
+        """The receiver, with default values where the file contains none."""
         return self.receiver or ReceiverEntry()
 
     def survey(self, profile: Profile | None) -> Survey:
-        """As the estimator takes it; lamps in order of their numbers, the profile's depth where the file says none."""
+        """The survey as an estimator type, lamps by number; a missing modulation depth is the profile's."""
         lamps = sorted((entry.lamp() for entry in self.lamp), key=lambda lamp: lamp.lamp_id)
         return Survey(tuple(lamps), self.eye.receiver(), self.floor, self._depth(profile))
 
@@ -137,5 +137,5 @@ class SurveyTree(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 
 def order_of(half_angle_deg: float) -> float:
-    """Lambert order of a lamp whose intensity has halved at this angle (Eq. 1)."""
+    """Lambert order of a lamp whose intensity halves at this angle in degrees (Eq. 1)."""
     return -math.log(2.0) / math.log(math.cos(math.radians(half_angle_deg)))

@@ -1,1 +1,1 @@
-"""Devices as the daemon uses them; `conversion` is the only place where device units become SI."""
+"""Device adapters of the daemon; `conversion` is the only place where device units become SI."""

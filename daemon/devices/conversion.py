@@ -1,6 +1,7 @@
-"""From device units to SI: the only place where steps, range units and foreign clocks become metres, frames and t_mono.
+"""Conversion of device readings to SI: lidar steps, range units and device clocks to metres, frames and t_mono.
 
-What a device reports stays three-valued on its way: a distance, nothing up to a bound, or no statement at all.
+No other module converts device units. A range keeps three possible meanings: a distance, nothing up to a limit, or no
+information.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from hal.odometry import RawOdometry
 
 @dataclass(frozen=True, slots=True)
 class RangeFacts:
-    """What a data sheet says about a model's ranges and the device itself does not.
+    """Range properties of a lidar model from its data sheet, which the device itself does not report.
 
     Attributes:
         sigma_m: one-sigma repeatability over the range that matters indoors.
         free_m: range up to which even a dark surface (10 % diffuse reflectance) returns an echo, so that "no return"
-            says that nothing is there; 0 where the data sheet does not promise it.
+            means free space; 0 where the data sheet does not guarantee it.
     """
 
     sigma_m: float
@@ -47,13 +48,13 @@ UNKNOWN_MODEL: Final = RangeFacts(0.02)
 
 
 def range_facts(model: str) -> RangeFacts:
-    """Facts of a model, cautious ones for a model that nobody has described."""
+    """Range properties of a model; cautious ones for a model without an entry."""
     return next((facts for pattern, facts in FACTS if re.search(pattern, model)), UNKNOWN_MODEL)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sweep:
-    """What is the same for every scan of one geometry."""
+    """Arrays that are the same for every scan of one geometry."""
 
     bearing_rad: Array
     unmasked: npt.NDArray[np.bool_]
@@ -62,17 +63,17 @@ class _Sweep:
 
 
 class ScanBridge:
-    """Turns raw scans into SI scans; holds nothing but arrays that follow from configuration and geometry."""
+    """Converts raw scans to SI scans; its only state is arrays derived from configuration and geometry."""
 
     def __init__(self, config: LidarConfig) -> None:
         mount = config.mount
         self._config = config
         self._sweeps: dict[tuple[LidarGeometry, int, int, int], _Sweep] = {}
         self.T_base_lidar = np.array((mount.x, mount.y, math.radians(mount.yaw)))
-        """Mount of the lidar on the robot; a log's own mount may be put here before the first scan."""
+        """Mount of the lidar on the robot; a log's own mount may replace it before the first scan."""
 
     def scan(self, raw: RawScan) -> Scan:
-        """The same scan in SI units: mount, inversion, mask and the meaning of codes applied."""
+        """The scan in SI units, with mount, inversion, mask and the meaning of the range codes applied."""
         sweep = self._sweep(raw)
         unit = raw.geometry.range_unit_m
         range_m: Array = raw.ranges * np.float64(unit)
@@ -107,13 +108,13 @@ class ScanBridge:
         for begin, end in self._config.mask.sectors:
             unmasked &= ~in_sector(np.degrees(bearing), begin, end)
         if self._config.mount.inverted:
-            bearing = -bearing  # turned over about its own front axis
+            bearing = -bearing  # the lidar is mounted upside down, rotated about its front axis
         duration = geometry.beam_dt_s * stride * max(0, count - 1)
         return _Sweep(bearing, unmasked, duration, range_facts(geometry.model))
 
 
 def in_sector(bearing_deg: Array, begin: float, end: float) -> npt.NDArray[np.bool_]:
-    """Which bearings lie in the sector counter-clockwise from ``begin`` to ``end``, ends included; all in degrees."""
+    """Mask of the bearings in the sector counter-clockwise from ``begin`` to ``end``, ends included; all in degrees."""
     if abs(end - begin) >= 360.0:
         return np.ones(len(bearing_deg), dtype=bool)
     slack = 1e-9  # a bearing equal to an end must not be lost to rounding
@@ -121,18 +122,19 @@ def in_sector(bearing_deg: Array, begin: float, end: float) -> npt.NDArray[np.bo
 
 
 class OdometryBridge:
-    """Turns cumulative odometry into increments of the base, and notices when its sender starts anew.
+    """Converts cumulative odometry to increments of the base, and detects a restart of its sender.
 
-    Stamps are already on our clock (`RawOdometry.t_mono`); one from the future is cut to its arrival.
+    Stamps are already on our clock (`RawOdometry.t_mono`); a stamp in the future is limited to the time of arrival.
     """
 
     FASTEST_M_S: Final = 5.0
     FASTEST_RAD_S: Final = 10.0
-    """Faster than any indoor robot; what exceeds it plus the floor is a jump of the sender, not a motion."""
+    """Faster than any indoor robot, rad/s; a motion above this plus the minimum tolerance is a jump of the sender."""
     FLOOR_M: Final = 0.3
     FLOOR_RAD: Final = 0.6
     LONGEST_S: Final = 2.0
-    """Silence beyond this allows no more motion: a sender that restarts after a pause must still be noticed."""
+    """Longest interval in s that extends the permitted motion: a restart of the sender after a pause must still be
+    detected."""
 
     def __init__(self) -> None:
         self.jumps = 0
@@ -140,7 +142,7 @@ class OdometryBridge:
         self._last: tuple[float, Array] | None = None
 
     def increment(self, raw: RawOdometry) -> Odometry | None:
-        """The motion since the last reading; None for the first one, and after a jump."""
+        """Motion since the last reading; None for the first reading, and after a jump."""
         if not all(map(math.isfinite, (raw.t_mono, raw.x, raw.y, raw.yaw))):
             self.invalid += 1
             return None
@@ -165,17 +167,17 @@ class OdometryBridge:
 
 
 class ImuBridge:
-    """Turns yaw rates into angles turned between two readings (trapezoid rule)."""
+    """Converts yaw rates to the angle turned between two readings (trapezoid rule)."""
 
     LONGEST_S: Final = 0.2
-    """A longer gap between readings is no turn that anyone has measured."""
+    """Longest gap between readings in s; a rotation in a longer gap was not measured."""
 
     def __init__(self) -> None:
         self.invalid = 0
         self._last: tuple[float, float] | None = None
 
     def turn(self, raw: RawImu) -> Imu | None:
-        """The angle turned since the last reading; None for the first one, and after a gap."""
+        """Angle turned since the last reading; None for the first reading, and after a gap."""
         if not (math.isfinite(raw.yaw_rate) and math.isfinite(raw.t_mono)):
             self.invalid += 1
             return None
@@ -187,21 +189,21 @@ class ImuBridge:
 
 
 UNFIT: Final = Blemish.SHORT | Blemish.MISALIGNED | Blemish.STUCK
-"""Blocks with one of these are not what the light was; all else is for the decoder to judge."""
+"""Flags of blocks that do not represent the light; the decoder judges all others."""
 
 MEASURED: Final = 2e-3
-"""How well a driver measures its rate, relative: within this beyond the decoder's reach the decoder decides."""
+"""Relative accuracy of a driver's measured rate. Within this margin beyond the decoder's range, the decoder decides."""
 
 
 class SampleBridge:
-    """Turns a converter's blocks into blocks on the nominal rate of the air interface, each with its own time base.
+    """Converts a converter's blocks to blocks at the nominal rate of the air interface, each with its own time base.
 
-    The decoder looks for the sample clock about the nominal rate, so that is what every block is given; a converter
-    beyond the decoder's reach keeps its own rate, and :attr:`off_rate` says so.
+    The decoder searches the sample clock around the nominal rate, so every block is given that rate. A converter
+    outside the decoder's range keeps its own rate, and :attr:`off_rate` is set.
 
     Attributes:
-        unfit, dead, stretched: blocks dropped for their words, those of them that hold one word only, and blocks whose
-            samples may not be evenly spaced.
+        unfit, dead, stretched: blocks dropped for their words, those of them in which all words are equal, and blocks
+            whose samples may not be evenly spaced.
         rate_hz: conversions per second of the latest block as measured, 0 before the first.
     """
 
@@ -212,11 +214,11 @@ class SampleBridge:
 
     @property
     def off_rate(self) -> bool:
-        """Whether the converter is clocked so differently that no lamp can be decoded."""
+        """Whether the converter's clock is so far off that no lamp can be decoded."""
         return self.rate_hz > 0.0 and not self._reachable(self.rate_hz)
 
     def block(self, raw: RawSamples) -> SampleBlock | None:
-        """The same block as the decoder takes it; None for words that the light never was."""
+        """The block in decoder format; None for words that do not represent the light."""
         if raw.blemish & UNFIT or raw.words.size == 0:
             self.unfit += 1
             self.dead += Blemish.STUCK in raw.blemish

@@ -1,7 +1,9 @@
 """Setup of the light channel: the survey, the air interface, the sample clock, and the residual map.
 
-It is read once, kept in a recording, and taken from there by a replay: the survey file may have changed since. All
-of it is in the head of every segment but the residual map, which is large: a file in the recording's folder holds it.
+It is read once and stored in a recording. A replay uses the stored setup, because the survey file may have changed
+since.
+The head of every segment contains all of it but the residual map, which is large: a file in the recording's folder
+holds that.
 """
 
 from __future__ import annotations
@@ -20,17 +22,17 @@ from daemon.devices.photodiode import profile_of
 from estimator import PROFILES, Profile, Survey
 
 HEADER: Final = "lights"
-"""Key of a recording's head."""
+"""Key in a recording's head."""
 RESIDUALS: Final = "lights.residuals.npz"
-"""File of a recording's folder."""
+"""File name in the recording's folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lights:
-    """A photodiode and what it looks at.
+    """Light channel of a robot with a photodiode.
 
     Attributes:
-        survey: lamps and receiver; without lamps in it they have to describe themselves.
+        survey: lamps and receiver; without lamps in it, they have to send their own data.
         profile: air interface. clock_ppm: stored error of the sample clock; None: to be found.
         residuals: content of the residual map beside the survey, empty without one; read by the estimator's loader.
     """
@@ -41,7 +43,7 @@ class Lights:
     residuals: bytes = b""
 
     def header(self) -> dict[str, Any]:
-        """What a recording keeps in the head of every segment."""
+        """Entry for the head of every segment of a recording."""
         kept = {
             "survey": msgspec.to_builtins(self.survey),
             "profile": self.profile.name,
@@ -52,10 +54,10 @@ class Lights:
 
 
 def load_lights(settings: Config, clock_ppm: float | None = None) -> Lights | None:
-    """What the configuration says of lights; None where there is no photodiode.
+    """Read the configured light setup; None where there is no photodiode.
 
     Raises:
-        SurveyError: the survey cannot be used; names the place and the remedy.
+        SurveyError: the survey cannot be used; the text contains the position and the remedy.
     """
     path = settings.lights.survey
     profile = profile_of(settings.photodiode)
@@ -66,7 +68,7 @@ def load_lights(settings: Config, clock_ppm: float | None = None) -> Lights | No
 
 
 def read_residuals(survey: Path) -> bytes:
-    """Content of the map beside a survey, empty where there is none; raises `SurveyError`."""
+    """Content of the residual map beside a survey, empty where there is none; raises `SurveyError`."""
     path = residuals_beside(survey)
     try:
         return path.read_bytes()
@@ -77,19 +79,22 @@ def read_residuals(survey: Path) -> bytes:
 
 
 def from_header(header: dict[str, Any], folder: Path | None = None) -> Lights | None:
-    """What a recording was made with; None where it had no photodiode.
+    """Light setup of a recording; None where it had no photodiode.
 
-    ``folder`` is where its segments lie; without the residual map in it there is none (:func:`lost_residuals`).
+    ``folder`` is that of its segments. If it does not contain the residual map, the setup has none
+    (:func:`lost_residuals`).
 
     Raises:
-        ValueError: it is not of this version.
+        ValueError: the header is not of this version.
     """
     kept = header.get(HEADER)
     if kept is None:
         return None
     try:
         survey = msgspec.convert(kept["survey"], Survey)
-        inside = base64.b64decode(kept.get("residuals", ""), validate=True)  # as recordings were written at first
+        inside = base64.b64decode(
+            kept.get("residuals", ""), validate=True
+        )  # recordings of an early version contain it here
         residuals = inside or _kept_residuals(folder, kept.get("residuals_sha256", ""))
         return Lights(survey, PROFILES[kept["profile"]], kept["clock_ppm"], residuals)
     except (KeyError, TypeError, ValueError, msgspec.ValidationError) as error:
@@ -97,12 +102,12 @@ def from_header(header: dict[str, Any], folder: Path | None = None) -> Lights | 
 
 
 def lost_residuals(header: dict[str, Any], lights: Lights) -> bool:
-    """Whether a recording was made with a residual map that is not there any more, or not as it was."""
+    """Whether a recording was made with a residual map that is now missing or changed."""
     return bool(header[HEADER].get("residuals_sha256")) and not lights.residuals
 
 
 def _kept_residuals(folder: Path | None, digest: str) -> bytes:
-    """The residual map in a recording's folder, empty where it is not the one with that digest."""
+    """Residual map in a recording's folder; empty where its digest differs."""
     if folder is None or not digest:
         return b""
     try:

@@ -1,4 +1,4 @@
-"""The photodiode's converter as the daemon sees it: made from the configuration, and watched for silence."""
+"""Photodiode converter: creates its driver from the configuration, and detects missing sample blocks."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from hal.bus.i2c import BusOpener
 from hal.clock import Clock
 
 SILENT_BLOCKS: Final = 3.0
-"""Blocks that may fail to come before the converter is said to be silent; the cycle shows it within two more. None is
-counted as shorter than it was asked for: an adapter that does only short ones hands them over many at a time."""
+"""Number of block periods without a block after which the converter has timed out; the cycle shows it within two more.
+The period is never below the configured one: an adapter with short blocks delivers many at a time."""
 
 
 class AdcMaker(Protocol):
-    """Makes a converter's driver from its configuration."""
+    """Factory of a converter's driver from its configuration."""
 
     def __call__(self, config: PhotodiodeConfig, clock: Clock, opener: BusOpener) -> Adc:
-        """A driver that is not running yet."""
+        """Return a driver that is not running yet."""
         ...
 
 
 def make_adc(config: PhotodiodeConfig, clock: Clock, opener: BusOpener) -> Adc:
-    """The driver of the configured converter, in blocks of the length that the air interface is meant for."""
+    """Driver of the configured converter, with the block length of the air interface."""
     from hal.photodiode.dc_channel import LevelInput
     from hal.photodiode.driver import PhotodiodeAdc, Sampling
 
@@ -38,12 +38,12 @@ def make_adc(config: PhotodiodeConfig, clock: Clock, opener: BusOpener) -> Adc:
 
 
 def profile_of(config: PhotodiodeConfig) -> Profile:
-    """The configured air interface."""
+    """Air interface profile of the configuration."""
     return PROFILES[config.profile]
 
 
 class BlockWatch:
-    """Knows when the latest block came, and how long blocks are.
+    """Arrival monitor of sample blocks.
 
     Attributes:
         status: of the driver, live. seconds: length of a block.
@@ -55,10 +55,10 @@ class BlockWatch:
         self._latest: float | None = None
 
     def on_block(self, block: RawSamples) -> None:
-        """A block that can be used was taken."""
+        """Register a usable block."""
         self.seconds = block.words.size / block.rate_hz
         self._latest = block.t1
 
     def ok(self, t_mono: float) -> bool:
-        """Whether blocks are coming."""
+        """Whether blocks are arriving."""
         return self._latest is not None and t_mono - self._latest <= SILENT_BLOCKS * max(self.seconds, self._asked_s)

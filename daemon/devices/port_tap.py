@@ -1,4 +1,4 @@
-"""Taps on ports: pass every byte on to the recording and to the clients of raw bytes."""
+"""Port taps: copy every byte of a device port to the recording and to the stream's clients of raw bytes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hal.port.port import OnData, OnLost, Port, PortOpener
 from hal.replay.recording import Kind
 
 Passed = Callable[[Kind, float, bytes], None]
-"""Takes what has passed: what it was (RX, TX, OPEN, LOST, BAUD), when, and the bytes. It must return at once."""
+"""Observer of port traffic: kind (RX, TX, OPEN, LOST, BAUD), time, and the bytes. It must return at once."""
 
 
 def tapped(opener: PortOpener, passed: Passed, clock: Clock) -> PortOpener:
-    """A port opener of whose ports ``passed`` is told everything that passes through them."""
+    """Wrap a port opener so that ``passed`` receives all traffic of the ports it opens."""
 
     async def open_tapped(device: str, baud: int) -> Port:
         port = await opener(device, baud)
@@ -25,7 +25,7 @@ def tapped(opener: PortOpener, passed: Passed, clock: Clock) -> PortOpener:
 
 
 class _TappedPort:
-    """A port that tells everything that passes through it (`hal.port.port.Port`)."""
+    """Port that copies all its traffic to an observer (`hal.port.port.Port`)."""
 
     def __init__(self, port: Port, passed: Passed, clock: Clock) -> None:
         self._port = port
@@ -34,11 +34,11 @@ class _TappedPort:
 
     @property
     def name(self) -> str:
-        """The port as the user named it."""
+        """Port name as configured."""
         return self._port.name
 
     def start(self, on_data: OnData, on_lost: OnLost) -> None:
-        """Begin delivering; bytes are told before anybody else sees them."""
+        """Begin delivery; the observer receives bytes before the driver."""
         passed = self._passed
 
         def keep(data: bytes, t_rx: float) -> None:
@@ -52,7 +52,7 @@ class _TappedPort:
         self._port.start(keep, lose)
 
     def write(self, data: bytes) -> None:
-        """Send a short command; it is told once the port has taken it."""
+        """Send a short command; the observer receives it once the port has accepted it."""
         self._port.write(data)
         self._passed(Kind.TX, self._clock.now(), data)
 

@@ -1,8 +1,8 @@
-"""The converter's sample clock, kept from one start to the next.
+"""Stored sample clock error of the converter: a small file per converter, for the next start.
 
-No bus runs at its nominal rate. The decoder finds by how much it is off, which takes seconds at the first start ever;
-what it has found is kept in a small file, so that the next start sees lamps within a quarter of a second. The file is
-a convenience: where it is missing, damaged or cannot be written, the clock is found anew.
+No bus runs at its nominal rate. The decoder finds the rate error, which takes seconds at the very first start. With the
+stored value, the next start receives lamps within a quarter of a second.
+The file is a convenience: where it is missing, damaged or cannot be written, the error is found again.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ log = logging.getLogger(__name__)
 
 FILE: Final = "sample-clock.json"
 MOVED_PPM: Final = 20.0
-"""A change that is worth writing: the decoder is content with 200 ppm."""
+"""Change in ppm that is written; the decoder tolerates 200 ppm."""
 RETRY_S: Final = 60.0
 CLOSE_S: Final = 1.0
 
 
 class SampleClock:
-    """The stored sample clock of one converter.
+    """Stored sample clock error of one converter.
 
     Attributes:
-        ppm: error of the sample clock as it was found last, None while it is not known.
+        ppm: latest error of the sample clock, None while it is not available.
     """
 
     def __init__(self, config: PhotodiodeConfig, folder: Path | None = None) -> None:
-        """Read what is stored for this converter on this bus; whatever is wrong with the file is said and passed over.
+        """Read the stored value for this converter on this bus; a defective file is logged and ignored.
 
         Args:
             config: of the photodiode.
-            folder: where it is kept; None: :func:`state_folder`.
+            folder: of the file; None: :func:`state_folder`.
         """
         self._path = (folder or state_folder()) / FILE
         self._key = f"{config.bus} {config.converter} {config.profile}"
@@ -52,7 +52,10 @@ class SampleClock:
         self._thread: threading.Thread | None = None
 
     def learn(self, ppm: float | None) -> None:
-        """Take in what the decoder has found, again and again; if it is news, a thread writes it. Returns at once."""
+        """Update the value from the decoder; a thread writes a sufficient change.
+
+        Returns at once; call it at any rate.
+        """
         if ppm is not None and self._possible(ppm) and (self.ppm is None or abs(ppm - self.ppm) >= MOVED_PPM):
             self.ppm = ppm
         busy = self._thread is not None and self._thread.is_alive()
@@ -65,17 +68,17 @@ class SampleClock:
             self._refuse(error)
 
     def close(self) -> None:
-        """Wait for what is being written, for a second at most; idempotent."""
+        """Wait at most one second for a write in progress; idempotent."""
         if self._thread is not None and self._thread.is_alive():
             self._thread.join(CLOSE_S)
 
     def _write(self, ppm: float) -> None:
-        """In the thread: a disk that hangs costs the memory of the clock and nothing else."""
+        """Write in a thread: a disk that hangs costs the stored value and nothing else."""
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             known = {**self._read(), self._key: round(ppm, 1)}
             write_whole(self._path, f"{json.dumps(known, indent=2)}\n".encode())
-        except Exception as error:  # noqa: BLE001  it is told, and the decoder finds the clock anew
+        except Exception as error:  # noqa: BLE001  it is logged, and the decoder finds the clock error again
             self._refuse(error)
         else:
             self._kept, self._refused = ppm, False

@@ -1,1 +1,1 @@
-"""Faults and reasons with their texts, and the assessment of the process and its parts."""
+"""Faults and reasons with their texts, and the health of the process and its components."""

@@ -1,4 +1,4 @@
-"""Which faults are present, from counters and facts sampled once a second."""
+"""Fault assessment: derives the present faults from counters and facts sampled once a second."""
 
 from __future__ import annotations
 
@@ -12,40 +12,41 @@ from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused, H
 from hal.lidar import Link
 
 WINDOW_S: Final = 10.0
-"""Rates are judged over the latest vitals that are at least this far apart, or all there are."""
+"""Rates are computed over the latest samples that are at least this far apart (s), or over all available."""
 STALLED_PERIODS: Final = 2.0
-"""Scan periods by which the loop may be late: the next one would be taken for a silent lidar."""
+"""Delay of the loop, in scan periods, from which the next delay could appear as a lidar without data."""
 FEW: Final = 2
-"""Events that are no rate yet: shortly after the start a single one would be a large part of all."""
+"""Number of events that is no rate yet: shortly after the start, one event would be a large share of all."""
 REPLAYED: Final = frozenset(
     (
         *(Fault.NO_LAMPS, Fault.SURVEY_CONTRADICTED, Fault.TWIN_LAMPS, Fault.LAMP_MOVED, Fault.LAMP_DEAD),
         *(Fault.LIDAR_MISFIT, Fault.ODOMETRY_SILENT, Fault.ODOMETRY_DISAGREES, Fault.PROTECTION_ALERT),
     )
 )
-"""What the data alone say, moment by moment: a replay has them again. All others are said by drivers, by the computer,
-or are rates of what was lost before it was recorded."""
+"""Faults that follow from the data alone, so that a replay reproduces them. All others come from drivers or from the
+computer, or are rates of data lost before recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vitals:
-    """Counters and facts of one moment (``t_mono``); counters run from the start of the process.
+    """Counters and facts at one instant (``t_mono``, s); counters run from the start of the process.
 
     Attributes:
         link, error: of the lidar driver. silent: no valid scan for three scan periods.
         scans, missed, invalid: the driver's counters. period: scan period in seconds.
-        late: counter of scans that arrived late. lag: seconds by which they are stamped later than the wheels' turns,
-            0: none is known. misfit: what they say is at odds with the map.
-        odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the laser.
-        readings, readings_missed, readings_old: counters of odometry readings that came, were lost, and came late.
-        readings_seldom: they come more seldom than before.
+        late: counter of scans that arrived late. lag: time offset in s of the scan stamps behind the odometry, 0: not
+            available. misfit: scans are inconsistent with the map.
+        odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the lidar.
+        readings, readings_missed, readings_old: counters of odometry readings that arrived, were lost, and arrived
+            late.
+        readings_seldom: they arrive at a lower rate than before.
         adc: whether blocks of samples arrive, None where there is no photodiode. adc_link, adc_error: of its driver.
-        blocks, lost, unfit, stalled: counters of blocks. off_rate: clocked beyond the decoder's reach.
-        lamps: what is wrong with lamps and survey.
-        cycles, overruns, jobs_failed: counters; short: of cycles without map work or laser for lack of time.
-        lateness: worst lateness of the loop lately, seconds.
-        alert: the bound on the position error is above the limit that is set, and this has been said.
-        failed: names of parts that are down at the moment.
+        blocks, lost, unfit, stalled: counters of blocks. off_rate: clocked outside the decoder's range.
+        lamps: faults of lamps and survey.
+        cycles, overruns, jobs_failed: counters; short: of cycles without map work or lidar for lack of time.
+        lateness: largest recent delay of the loop, seconds.
+        alert: the protection level exceeds the alert limit, and this has been reported.
+        failed: names of components that are down at the moment.
     """
 
     t_mono: float
@@ -85,7 +86,7 @@ class Vitals:
 
 
 def assess(now: Vitals, before: Vitals) -> tuple[Fault, ...]:
-    """Faults that are present, gravest first; ``before`` are vitals of about :data:`WINDOW_S` ago."""
+    """Present faults, gravest first; ``before`` are vitals of about :data:`WINDOW_S` ago."""
     found = [*_lidar(now, before), *_odometry(now, before), *_computer(now, before), *_outputs(now)]
     if now.adc is not None:
         found += [*_photodiode(now, before), *now.lamps]
@@ -93,17 +94,17 @@ def assess(now: Vitals, before: Vitals) -> tuple[Fault, ...]:
 
 
 def describe(fault: Fault, now: Vitals | None = None) -> str:
-    """One line for a log: number, meaning, remedy, and what the device's driver or the data say of it ``now``."""
+    """Log line of a fault: number, meaning, remedy, and the present detail from the driver or the data in ``now``."""
     text, remedy = FAULTS[fault]
     own = now is not None and fault is Fault.LIDAR_REFUSED and now.error is not None and now.error.remedy
-    if own:  # the table's is for serial ports and networks, the driver knows which it is
+    if own:  # the table's remedy is for serial ports and networks; the driver has the one for its device
         remedy = ""
     line = f"fault {int(fault)}: {text} ({remedy})" if remedy else f"fault {int(fault)}: {text}"
     return f"{line}: {words}" if now is not None and (words := _words(fault, now)) else line
 
 
 def _words(fault: Fault, now: Vitals) -> str:
-    """The driver's error that a fault stands for, the parts that are down, or the lag, if it stands for one."""
+    """Detail of a fault: the driver's error, the components that are down, or the time offset; empty without one."""
     if now.error is not None and fault is _noun(now.error):
         return str(now.error)
     if now.adc_error is not None and fault is _adc_noun(now.adc_error):
@@ -149,7 +150,7 @@ ADC_NOUNS: Final[tuple[tuple[type[HalError], Fault], ...]] = (
     (DataInvalid, Fault.ADC_GARBLED),
     (HalError, Fault.ADC_BUS_FAULTY),
 )
-"""What a converter's driver says, by kind: the first that fits."""
+"""Faults by type of a converter's driver error; the first match counts."""
 
 
 def _adc_noun(error: HalError) -> Fault:
@@ -174,7 +175,7 @@ def _photodiode(now: Vitals, before: Vitals) -> Iterable[Fault]:
 
 
 def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
-    if now.odometry is False and now.cycles > 0:  # readings count from the first cycle on
+    if now.odometry is False and now.cycles > 0:  # readings are counted from the first cycle on
         yield Fault.ODOMETRY_SILENT
     if now.odometry_jumps > before.odometry_jumps:
         yield Fault.ODOMETRY_JUMPS
@@ -190,7 +191,7 @@ def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
 
 
 def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
-    if now.cycles and now.lateness > STALLED_PERIODS * now.period:  # while kernels are compiled it may well be late
+    if now.cycles and now.lateness > STALLED_PERIODS * now.period:  # delays are normal while kernels are compiled
         yield Fault.LOOP_STALLED
     if now.overruns - before.overruns > FEW + 0.05 * (now.cycles - before.cycles):
         yield Fault.OVERRUNS
@@ -207,9 +208,9 @@ STORE: Final = {
     "flight recorder": Fault.FLIGHT_RECORDER_FAILED,
     "thread": Fault.THREAD_HANGS,
 }
-"""Parts that keep things, and threads, by name, and what it means that they are down."""
+"""Faults by name of a component or thread that stores data and is down."""
 PUBLISHERS: Final = frozenset(["modbus", "modbus serial", "pose", "pose subscriptions", "stream", "publisher"])
-"""Parts that publish, by name, and what the cycle says of those that it calls."""
+"""Names of components that publish, including those that the cycle calls."""
 
 
 def _outputs(now: Vitals) -> Iterable[Fault]:
@@ -229,5 +230,5 @@ def _publishers(now: Vitals) -> frozenset[str]:
 
 
 def _others(now: Vitals) -> frozenset[str]:
-    """Parts that are down and have no fault of their own."""
+    """Components that are down and have no fault of their own."""
     return now.failed - {"recorder", *STORE} - PUBLISHERS

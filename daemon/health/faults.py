@@ -1,4 +1,4 @@
-"""All faults: what may be wrong, each with a number, a text and a remedy."""
+"""Fault table: every fault with its number, meaning and remedy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 
 
 class Fault(IntEnum):
-    """Present faults, the gravest first. Numbers are part of the contract: never renumber."""
+    """Faults, the gravest first. Numbers are part of the contract: never renumber."""
 
     NONE = 0
     LIDAR_MISSING = 101
@@ -202,9 +202,9 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "the log names it: look for a disk or a bus that hangs; a computation that hangs ends in a restart",
     ),
 }
-"""For every fault what it means and what a person can do."""
+"""Meaning and remedy of every fault."""
 
 
 def describe_over(fault: Fault, seconds: float) -> str:
-    """One line for a log: a fault that is over, and how long it was there."""
+    """Log line of a fault that is over, with its duration in s."""
     return f"over: fault {int(fault)}: {FAULTS[fault][0]}; it lasted {seconds:.0f} s"

@@ -1,4 +1,4 @@
-"""The faults that are present: the heartbeat sets them, the cycle and the reports read them."""
+"""Shared list of present faults: the heartbeat writes it; the cycle and the reports read it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from daemon.health.faults import Fault
 
 @dataclass(slots=True)
 class PresentFaults:
-    """Faults that are present, gravest first."""
+    """Present faults, gravest first."""
 
     faults: tuple[Fault, ...] = ()
 
     def gravest(self) -> int:
-        """Number of the gravest one, 0 for none."""
+        """Number of the gravest present fault, 0 for none."""
         return int(self.faults[0]) if self.faults else 0

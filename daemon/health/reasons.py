@@ -1,4 +1,4 @@
-"""Why the state is what it is: every reason with what it means and what a person can do."""
+"""Reason table: every reason of a state with its number, meaning and remedy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 
 
 class Reason(IntEnum):
-    """Why the state is what it is. Numbers are part of the contract: never renumber."""
+    """Reasons of the published state. Numbers are part of the contract: never renumber."""
 
     NONE = 0
     WARMING_UP = 1
@@ -90,4 +90,4 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
         "take load off the computer, or raise `cycle.budget_ms`",
     ),
 }
-"""For every reason what it means and what a person can do."""
+"""Meaning and remedy of every reason."""

@@ -1,4 +1,4 @@
-"""The condition of the daemon as it is published: all faults, restarts by part, what is down, what hangs, uptime."""
+"""Published health of the daemon: present faults, restarts by component, components down, hanging threads, uptime."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ NAMES: Final = {
     "stream": Part.STREAM,
     "map": Part.MAP,
 }
-"""Parts by the names that the supervisor knows them by; what is not named here is OTHER."""
+"""Components by their name in the supervisor; every other name is OTHER."""
 
 
 class Reporter:
-    """Makes the condition anew once a second, and when the faults change; in between it is the same object.
+    """Builds the health record once a second and when the faults change; between these it returns the same object.
 
     Args:
-        clock: of the daemon. supervisor: restarts of parts. threads: those that hang. faults: those that are present.
-        drivers: status of lidar and converter; None: there is none.
+        clock: of the daemon. supervisor: restarts of components. threads: hang detection. faults: those present.
+        drivers: status of lidar and converter; None: not fitted.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Reporter:
         self._shown: tuple[int, tuple[Fault, ...], Condition] | None = None
 
     def __call__(self) -> Condition:
-        """The condition of this moment."""
+        """The present health record."""
         second, faults = int(self._clock.now() - self._begun), self._faults.faults
         shown = self._shown
         if shown is None or shown[0] != second or shown[1] is not faults:

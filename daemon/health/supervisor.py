@@ -1,4 +1,4 @@
-"""Keeps the daemon's parts running: a part that fails is restarted with back-off; its loss and return are said once."""
+"""Component supervisor: restarts a failed component with back-off, and logs its failure and recovery once."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ log = logging.getLogger(__name__)
 FIRST_S: Final = 0.5
 LONGEST_S: Final = 30.0
 STEADY_S: Final = 60.0
-"""A part that ran for this long is taken to be well: its next failure starts the back-off anew."""
+"""Run time in s after which a component counts as healthy: its next failure starts the back-off again."""
 
 
 @dataclass(slots=True)
 class Supervisor:
-    """Runs parts; knows which are down.
+    """Runs components and lists those that are down.
 
     Attributes:
-        failed: names of the parts that are down right now. restarts: failures so far, by name.
-        random: of the jitter, which keeps several parts from knocking in step.
+        failed: names of the components that are down at present. restarts: failures so far, by name.
+        random: source of the jitter, which keeps the retries of several components apart.
     """
 
     failed: set[str] = field(default_factory=set)
@@ -34,11 +34,11 @@ class Supervisor:
     random: Random = field(default_factory=Random)
 
     async def keep(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
-        """Run a part for ever. Returns if it ends by itself (a log's end); a cancelled one is not restarted.
+        """Run a component for ever. Returns if it ends by itself (a log's end); a cancelled one is not restarted.
 
-        A device's error is one line; anything else is a defect and logged in full, once until it works again or fails
-        in another way, and the part is restarted all the same: one broken publisher must not take the pose away from
-        the others.
+        A device error is logged in one line. Any other exception is a defect and is logged with its traceback, once
+        until the component works again or fails in another way. The component is restarted in both cases: one broken
+        publisher must not stop the pose for the others.
         """
         loop = asyncio.get_running_loop()
         pause, said = FIRST_S, ""
@@ -61,7 +61,7 @@ class Supervisor:
             pause = min(LONGEST_S, 2.0 * pause)
 
     async def _run(self, name: str, run: Callable[[], Awaitable[None]], begun: float) -> None:
-        """Run once; a part that is still running after the first back-off has returned."""
+        """Run the component once; it counts as recovered if it still runs after the first back-off."""
         loop = asyncio.get_running_loop()
         returned = loop.call_at(begun + FIRST_S, self._returned, name)
         try:

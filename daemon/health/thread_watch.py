@@ -1,7 +1,8 @@
 """Hang detection: each worker thread reports the start time of its current job.
 
-What a restart cures (a computation that hangs) keeps the watchdog from being fed, what it does not cure is only said:
-a thread that hangs in the kernel, at a disk or a bus, hangs in the next process too, and ends this one's localisation.
+If a restart helps (a computation that hangs), the watchdog is not triggered any more and the service restarts.
+Otherwise the hang is only reported. A thread that hangs in the kernel, at a disk or a bus, would hang in the next
+process too. The restart would end the present localisation for nothing.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from daemon.snapshot import Thread
 log = logging.getLogger(__name__)
 
 COMPUTING_S: Final = 120.0
-"""No job takes that long: the longest are a few seconds, on a slow computer some more."""
+"""Time limit of a computing job, s: the longest jobs take a few seconds, on a slow computer somewhat more."""
 DISK_S: Final = 30.0
-"""Nor does a disk that works, however many are at it."""
+"""Time limit of disk access, s: a working disk responds sooner, whatever its load."""
 CURED: Final = frozenset([Thread.SOLVER, Thread.SEARCH])
-"""Threads whose hanging a restart cures."""
+"""Threads for which a restart ends a hang."""
 
 Since = Callable[[], float | None]
-"""Since when a thread has been busy with one thing (`time.monotonic`), None while it waits for something to do."""
+"""Start time of a thread's current job (`time.monotonic`, s); None while it waits for a job."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +36,10 @@ class _Watched:
 
 
 class ThreadWatch:
-    """Watches threads; :meth:`look` once per heartbeat.
+    """Hang detection of threads; call :meth:`look` once per heartbeat.
 
     Attributes:
-        hanging: those that have not come back for longer than they may take.
+        hanging: threads whose current job exceeds its time limit.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -47,11 +48,11 @@ class ThreadWatch:
         self._watched: list[_Watched] = []
 
     def watch(self, thread: Thread, since: Since, limit_s: float) -> None:
-        """Watch one more."""
+        """Add a thread with its time limit in s."""
         self._watched.append(_Watched(thread, since, limit_s))
 
     def look(self) -> frozenset[Thread]:
-        """Which hang now; each is said once when it does and once when it has come back."""
+        """Threads that hang at present; the start and the end of each hang are logged once."""
         now, before = self._now(), self.hanging
         self.hanging = frozenset(one.thread for one in self._watched if _busy(one, now) > one.limit_s)
         for one in self._watched:
@@ -64,7 +65,7 @@ class ThreadWatch:
 
     @property
     def alive(self) -> bool:
-        """Whether the watchdog may be fed."""
+        """Whether the watchdog may be triggered: no thread hangs that a restart would cure."""
         return not self.hanging & CURED
 
 

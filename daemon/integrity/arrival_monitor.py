@@ -6,22 +6,25 @@ from collections import deque
 from typing import Final
 
 ODOMETRY_SILENT_S: Final = 1.0
-"""Odometry that has not arrived for this long is silent."""
+"""Time in s without a reading after which odometry has timed out."""
 WINDOW_S: Final = 2.0
 ENOUGH: Final = 20
-"""Readings that a rate is judged by."""
+"""Number of readings from which a rate is computed."""
 READINGS: Final = 2560
-"""Readings whose arrival is kept: of a window and more at 1 kHz."""
+"""Number of arrival times that are kept: more than one window at 1 kHz."""
 FEWER: Final = 0.6
-"""Part of the usual rate of readings below which they come more seldom than before."""
+"""Share of the usual rate below which the rate counts as reduced."""
 LEAST_HZ: Final = 10.0
-"""Rate of readings that is asked for; less will do for a lidar that turns more slowly."""
+"""Largest rate that is required, Hz; a lidar with a longer scan period requires less."""
 LEARNING: Final = 0.03
-"""Weight of a window of readings in the usual rate: what lasts for a minute has become usual."""
+"""Weight of one window in the usual rate: a rate that lasts for a minute has become the usual one."""
 
 
 class Arrivals:
-    """Told of each reading as it arrives: with a slow lidar readings wait for a second and more for their cycle."""
+    """Arrival times of readings, registered at arrival.
+
+    With a slow lidar, readings wait a second and more for their cycle.
+    """
 
     def __init__(self) -> None:
         self._at: deque[float] = deque(maxlen=READINGS)
@@ -30,20 +33,23 @@ class Arrivals:
 
     @property
     def latest(self) -> float | None:
-        """When the latest one arrived; None: none has."""
+        """Time of the latest arrival; None before the first."""
         return self._at[-1] if self._at else None
 
     def on_reading(self, t_rx: float) -> None:
-        """A reading has arrived; what came before a silence says nothing of the rate now."""
+        """Register an arrival.
+
+        After a timeout the window is cleared, because older readings do not represent the present rate.
+        """
         if self._at and t_rx - self._at[-1] > ODOMETRY_SILENT_S:
             self._at.clear()
         self._at.append(t_rx)
 
     def seldom(self, t_mono: float, period: float) -> bool:
-        """Whether readings come more seldom than they used to, or than is required; learns the usual rate on the way.
+        """Whether readings arrive below their usual or the required rate; updates the usual rate.
 
-        The rate is learned once in half a window at most, however often this is called. The required rate goes by the
-        lidar only where that is slow: wheels at 20 Hz are no fault with scans at 40 Hz.
+        The usual rate is updated once in half a window at most, at any rate of calls. The required rate follows the
+        lidar only where that is slow: odometry at 20 Hz is no fault with scans at 40 Hz.
         """
         window = max(WINDOW_S, ENOUGH / self._usual_hz if self._usual_hz else 0.0)
         recent = sum(t_mono - t <= window for t in self._at)

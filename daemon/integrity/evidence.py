@@ -1,4 +1,4 @@
-"""What one cycle knows, as the state machine takes it: already judged by the cycle, in numbers and yes or no."""
+"""Evidence of one cycle: the input of the state machine, as numbers and flags that the cycle has derived."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Final
 from daemon.health.reasons import Reason
 
 SILENT_PERIODS: Final = 3.0
-"""Scan periods without a valid scan after which the lidar is said to be gone."""
+"""Scan periods without a valid scan after which the lidar has timed out."""
 VAGUE_M: Final = 0.15
 VAGUE_RAD: Final = 0.05
-"""One-sigma uncertainty beyond which TRACKING is not said. The heading's is 2.9 deg, of the 5 that TRACKING must not be
-off by: of those that were less sure, some were (docs/integrity.md)."""
+"""One-sigma limit above which the state is not TRACKING. For the heading it is 2.9 deg, while TRACKING permits an error
+of 5 deg: above the limit, some headings exceeded that (docs/integrity.md)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """What one scan's match says, already judged by the cycle.
+    """Result of one scan match.
 
     Attributes:
-        good: it is a result and enough of the scan took part.
-        known: (x, y, yaw) whether the match fixed the axis.
-        off_m, off_rad: by how much it moved the pose from where it was taken to be.
+        good: the match is valid and enough of the scan took part.
+        known: (x, y, yaw) whether the match determines the axis.
+        off_m, off_rad: correction of the predicted pose by the match.
     """
 
     good: bool
@@ -34,19 +34,20 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What light says, already judged by the cycle.
+    """Result of the light filter in one cycle.
 
     Attributes:
-        alive: samples arrive. used: lamps are received and used, and the place and heading they tell are good.
-        fits: enough lamps are received at a place like the pose's, though light, which has had to look for it anew,
-            is not sure of it by itself yet.
-        placed: it has been told by light where the map lies.
-        lost: what is received contradicts the place that light itself had told.
-        agrees: whether the light's place and the pose are the same within what both may be wrong; None: cannot be said.
-        moved: in this cycle the pose was moved to where light says, after the two had contradicted each other.
-        elsewhere: most of the lamps that are received cannot be received at the pose, in two epochs in a row.
-        apart: they are not, or are and one of the two is still on its way.
-        known: (x, y, yaw) whether the pose knows the axis, with or without a laser.
+        alive: samples arrive. used: lamps are received and in use, and position and heading of the light solution are
+            good.
+        fits: enough lamps are received at a position close to the pose's, although the restarted light filter has not
+            converged yet.
+        placed: light has aligned the map to the survey.
+        lost: the received lamps contradict the position of the light solution itself.
+        agrees: whether the light solution and the pose agree within their covariances; None: not available.
+        moved: in this cycle the pose moved to the light solution, after the two had disagreed.
+        elsewhere: most of the received lamps cannot be received at the pose, in two epochs in a row.
+        apart: the two solutions disagree, or one of them is still moving to the other.
+        known: (x, y, yaw) whether the pose determines the axis, with or without a lidar.
     """
 
     alive: bool
@@ -63,23 +64,23 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What one cycle knows. Times in seconds of ``t_mono``.
+    """Evidence of one cycle. Times in seconds of ``t_mono``.
 
     Attributes:
         t_mono: now.
         silence: scan periods since the last valid scan; None before the first.
-        unreachable: the driver has backed off, and said why, since the last valid scan.
+        unreachable: the driver has backed off with an error since the last valid scan.
         match: of the scan of this cycle; None without a scan or before there is a map to match against.
-        mapped: there is something to match against.
-        sigma_m, sigma_rad: one-sigma uncertainty (larger axis; heading) gained by motion that nothing has witnessed.
-        guessed: the map itself was laid upon a guess; the place in it stays one until something else tells it.
+        mapped: there is a map to match against.
+        sigma_m, sigma_rad: one-sigma uncertainty (larger axis; heading) gained by motion that no measurement confirmed.
+        guessed: the map itself was extended at an unconfirmed pose; the pose stays unconfirmed until other evidence.
         odometry: whether it is arriving; None where none is configured.
-        agree: whether wheels and laser told the same motion lately; None where that cannot be said.
-        places: how many places fit while the place is looked for (0: none yet); None: not looking.
-        ordered: a person has set the pose or reset the map in this cycle.
-        lidar: there is one. light: None where no photodiode is configured.
-        unused: why the laser is not used though it is there; None: it is.
-        recalled: the robot has just been found in the whole map, and where the run before has left it.
+        agree: whether odometry and lidar measured the same motion recently; None where not available.
+        places: number of hypotheses during relocalisation (0: none yet); None: no relocalisation.
+        ordered: an operator has set the pose or reset the map in this cycle.
+        lidar: a lidar is configured. light: None where no photodiode is configured.
+        unused: reason why an available lidar is not used; None: it is used.
+        recalled: relocalisation in the whole map has just found the pose at the stored pose of the previous run.
     """
 
     t_mono: float

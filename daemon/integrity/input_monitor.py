@@ -1,6 +1,6 @@
 """Input monitor: scans and readings that are late, lost, or inconsistent with the other sensors.
 
-Counters and facts for the vitals, fed by the cycle; nothing here changes what is done with the data.
+The cycle updates its counters and facts for the vitals; they have no effect on the processing of the data.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from hal.lidar import RawScan
 from hal.odometry import RawOdometry
 
 LATE_PERIODS: Final = 2.5
-"""Scan periods from a scan's first beam to its arrival: a revolution takes one, the line less than another."""
+"""Limit from a scan's first beam to its arrival, scan periods: the scan takes one, the line less than another."""
 LATE_S: Final = 0.15
-"""Age of an odometry reading at its arrival, as the clock of its sender tells."""
+"""Limit of the age of an odometry reading at its arrival by its sender's clock, s."""
 MISFIT_S: Final = 2.0
-"""A laser that is at odds with the map for this long is told, once the place had been known."""
+"""Time in s after which a lidar inconsistent with the map is reported, if the pose was available before."""
 NOWHERE_S: Final = 5.0
-"""The same after a start, where no place in the whole map fits; in a room a search takes 1.4 s of it."""
+"""The same after a start, when no pose in the whole map fits; in a room, the search takes 1.4 s of it."""
 FITS_S: Final = 1.5
-"""TRACKING has to last for this long to take it back: wrong ranges, too, now and then fit for a moment."""
+"""TRACKING has to last this long (s) to clear the fault: wrong ranges can also fit for a moment."""
 QUIET_S: Final = 10.0
-"""As long without a scan that does not fit takes it back, too: without a witness TRACKING may not come for hours."""
+"""So does this time in s without a scan that does not fit: with one solution alone, TRACKING may not come for hours."""
 DISAGREE_S: Final = 1.0
-"""Wheels and laser have to disagree for this long, as in the state machine."""
+"""Odometry and lidar have to disagree for this long (s), as in the state machine."""
 ODD: Final = (State.RELOCATING, State.AMBIGUOUS)
 
 
 class Watch:
-    """Watches arrivals and verdicts.
+    """Monitors arrivals and the state machine's results.
 
     Attributes:
-        late: scans that arrived late so far. readings, missed, old: odometry readings that came, that were lost on
-            their way, and that came late.
-        misfit: the laser is at odds with the map. disagree: with the wheels.
+        late: scans that arrived late so far. readings, missed, old: odometry readings that arrived, were lost on the
+            network, and arrived late.
+        misfit: the lidar is inconsistent with the map. disagree: it is inconsistent with the odometry.
     """
 
     def __init__(self) -> None:
@@ -51,11 +51,14 @@ class Watch:
         self._fits_since: float | None = None
 
     def on_scan(self, scan: RawScan, period: float) -> None:
-        """A scan has been taken."""
+        """Register a received scan."""
         self.late += scan.t_rx - scan.t_mono > LATE_PERIODS * period
 
     def on_odometry(self, reading: RawOdometry) -> None:
-        """A reading has been taken; what was lost while none came at all is told as silence."""
+        """Register a received reading.
+
+        Readings lost during a timeout are not counted; the timeout is reported instead.
+        """
         if self._t_reading is not None and reading.t_rx - self._t_reading > ODOMETRY_SILENT_S:
             reading = replace(reading, missed=0)
         self.readings += 1
@@ -64,13 +67,13 @@ class Watch:
         self._t_reading = reading.t_rx
 
     def on_verdict(self, t_mono: float, memory: Memory, scans: bool) -> None:
-        """A cycle has judged; ``scans``: they arrive and are compared with the map."""
+        """Update from the state machine's memory; ``scans``: they arrive and are compared with the map."""
         since = memory.disagree_since
         self.disagree = since is not None and t_mono - since >= DISAGREE_S
         self.misfit = self._at_odds(t_mono, memory, scans)
 
     def _at_odds(self, t_mono: float, memory: Memory, scans: bool) -> bool:
-        """Whether the laser has been at odds with the map for long enough to be told."""
+        """Whether the lidar has been inconsistent with the map for long enough to report it."""
         fits = memory.state is State.TRACKING
         self._known |= fits
         self._fits_since = (t_mono if self._fits_since is None else self._fits_since) if fits else None
@@ -89,6 +92,6 @@ class Watch:
 
 
 def _odd(memory: Memory) -> bool:
-    """Whether the latest scans do not fit; a pose that is only too uncertain is lost without a scan at odds with it."""
+    """Whether the latest scans do not fit. A pose can also be lost by its uncertainty alone, without such a scan."""
     lost = memory.state is State.LOST and memory.failed > 0
     return memory.reason is Reason.MATCH_FAILED or memory.state in ODD or lost

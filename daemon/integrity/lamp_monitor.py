@@ -1,7 +1,7 @@
 """Lamp monitor: faults of lamps and survey from the links of every epoch; each is logged once, with the lamp's number.
 
-A lamp is judged by how long the same thing has been said of it. What has been found stays until that lamp is received
-as it should be, for the robot may not come by again for a while.
+A lamp is judged by how long its link stays in the same state. Its fault stays until the lamp is received normally,
+because the robot may not pass it again for a while.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from estimator import UNUSABLE, BlockFlag, Fix, LightsResult, Link, LinkState
 log = logging.getLogger(__name__)
 
 LASTS_S: Final = 10.0
-"""For how long all must be so, and lamps must be odd, until it is no passing shadow."""
+"""Time in s for which a condition must last: a shorter one may be a passing obstruction."""
 TWIN_S: Final = 3.0
-"""Two lamps with one code; while one of them comes and the other goes they look like it for a moment."""
+"""The same for two lamps with one code: at a transition from one lamp to the next the condition occurs for a moment."""
 OVER_S: Final = 3.0
-"""For how long it must have been otherwise until it is over."""
+"""Time in s without the condition after which it is over."""
 FORGOTTEN_S: Final = 600.0
-"""What was found of a lamp that has not been seen since is forgotten."""
+"""Time in s after which the fault of a lamp that is not in view any more is discarded."""
 ENOUGH: Final = 3
-"""Links that make a majority worth the name."""
+"""Smallest number of links for a majority decision."""
 
 _ODD: Final = ((LinkState.REJECTED, Fault.LAMP_MOVED), (LinkState.MISSING, Fault.LAMP_DEAD))
 _UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING)
@@ -36,7 +36,7 @@ _SAID: Final = {
 
 @dataclass(slots=True)
 class _Lasting:
-    """Whether something has lasted, and has not been over for long."""
+    """Debounced condition: set after it has lasted ``seconds``, cleared after :data:`OVER_S` without it."""
 
     seconds: float
     since: float | None = None
@@ -55,11 +55,11 @@ class _Lasting:
 
 @dataclass(slots=True)
 class LampWatch:
-    """Watches the epochs go by.
+    """Derives lamp and survey faults from the epochs.
 
     Attributes:
-        faults: of lamps and survey, as of the latest epoch. stalled: blocks in which the bus stood still.
-        odd: lamps with what is wrong with them, and when that was last so.
+        faults: of lamps and survey, as of the latest epoch. stalled: blocks in which the bus stalled.
+        odd: faults by lamp, with the time of the latest occurrence.
     """
 
     faults: frozenset[Fault] = frozenset()
@@ -72,7 +72,7 @@ class LampWatch:
     _wrong: _Lasting = field(default_factory=lambda: _Lasting(LASTS_S))
 
     def on_step(self, t_mono: float, lights: LightsResult | None, fresh: bool) -> None:
-        """One step; ``fresh``: it took a block of samples in."""
+        """Update after one step; ``fresh``: the step consumed a block of samples."""
         if lights is None or not fresh:
             return
         if lights.block & UNUSABLE:
@@ -90,7 +90,7 @@ class LampWatch:
         self._sum_up({fault for fault, so in said.items() if so})
 
     def _pass_on(self, t_mono: float) -> None:
-        """A block that tells nothing of any lamp; enough of them, and what was said of all lamps holds no longer."""
+        """Update after an unusable block: after enough of them, the faults that concern all lamps are cleared."""
         watched = (Fault.NO_LAMPS, self._dark), (Fault.TWIN_LAMPS, self._twin), (Fault.SURVEY_CONTRADICTED, self._wrong)
         self._sum_up({fault for fault, lasting in watched if lasting.now(t_mono, so=False)})
 
@@ -99,7 +99,7 @@ class LampWatch:
         self.faults = frozenset(present | lamps)
 
     def _look_at_each(self, t_mono: float, links: tuple[Link, ...]) -> None:
-        """Find lamps that have been odd for long, and those that are well again; most links are neither."""
+        """Find lamps whose link has been faulty for long, and those that have recovered; most links are neither."""
         lamps = self._lamps
         for link in links:
             if link.lamp_id is None:
@@ -127,13 +127,13 @@ class LampWatch:
 
 
 def _twins(received: list[Link]) -> bool:
-    """Whether two of the lamps received cannot be told apart: neither by their places, nor because one is known."""
+    """Whether two received links share a code and cannot be told apart: state TWIN, or one lamp ID twice."""
     lamps = [link.lamp_id for link in received if link.lamp_id is not None]
     return any(link.state is LinkState.TWIN for link in received) or len(set(lamps)) < len(lamps)
 
 
 def _contradicted(lights: LightsResult, states: list[LinkState]) -> bool:
-    """Whether survey and light do not belong together: most lamps are odd, none is known, or the place was given up."""
+    """Whether light contradicts the survey: position lost, no code in the survey, or most links rejected."""
     known = [state for state in states if state is not LinkState.UNSURVEYED]
     rejected = known.count(LinkState.REJECTED)
     strange = len(states) >= ENOUGH and not known

@@ -1,6 +1,6 @@
-"""Hysteresis for OVERLOADED: set when a cycle skips the laser, cleared after N consecutive cycles that used it.
+"""Hysteresis for OVERLOADED: set when a cycle skips the lidar, cleared after N consecutive cycles that used it.
 
-A computer that is nearly fast enough takes it in and leaves it out by turns; state, reason and log would flicker.
+A computer that is nearly fast enough alternates between using and skipping it; state, reason and log would flicker.
 """
 
 from __future__ import annotations
@@ -8,18 +8,18 @@ from __future__ import annotations
 from typing import Final
 
 TAKEN_UP: Final = 5
-"""Steps in a row that take the laser in again until it is no longer said to be left out: a few are trials."""
+"""N at first: consecutive steps with the lidar that clear the flag; fewer may be trials."""
 LONGEST: Final = 640
-"""The same where that has not lasted, again and again: 16 s at 40 Hz."""
+"""Upper limit of N, which doubles at each early relapse: 16 s at 40 Hz."""
 CALM: Final = 2400
-"""Steps with the laser after which it counts as the first time: a minute at 40 Hz."""
+"""Consecutive steps with the lidar after which N returns to its first value: a minute at 40 Hz."""
 
 
 class LeftOut:
-    """Fed once a step.
+    """Hysteresis of the flag; call :meth:`on_step` once a step.
 
     Attributes:
-        told: whether the laser is to be called left out.
+        told: the flag: the lidar is reported as skipped.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class LeftOut:
         self._used = CALM
 
     def on_step(self, left_out: bool) -> bool:
-        """Take in whether this step left the laser out; what is to be told of it."""
+        """Update with one step (``left_out``: it skipped the lidar) and return the flag."""
         if not left_out:
             self._used += 1
             self.told = self.told and self._used < self._needed
@@ -39,5 +39,5 @@ class LeftOut:
         return True
 
     def clear(self) -> None:
-        """It was left out by order, and is not any more."""
+        """Reset after a commanded pause, in which the lidar was skipped on purpose."""
         self.told, self._used, self._needed = False, CALM, TAKEN_UP

@@ -1,8 +1,9 @@
-"""Consistency of odometry and laser: compares their motion over a sliding window of the last seconds.
+"""Motion consistency of odometry and lidar: compares their motion over a sliding window of the last seconds.
 
-The laser's witness is ``T_odom_base`` at scans whose match fixed every axis; the wheels' witness is the bare chain of
-odometry increments, which the laser never touches. Where a match did not fix an axis, the pose took that axis from the
-wheels, and agreement would be an echo: such scans empty the window.
+The lidar's motion is that of ``T_odom_base`` at scans whose match fixed every axis. The odometry's motion is the chain
+of its increments alone, which the lidar never affects.
+Where a match did not fix an axis, the pose took that axis from the odometry, and the comparison would be circular. Such
+scans empty the window.
 """
 
 from __future__ import annotations
@@ -15,20 +16,21 @@ from typing import Final
 from estimator import Array, Odometry, se2
 
 WINDOW_S: Final = 2.0
-"""Long against stamp jitter, short against odometry drift."""
+"""Window in s: long against stamp jitter, short against odometry drift."""
 SHORTEST: Final = 0.5
-"""Part of the window that has to be covered before anything is said."""
+"""Share of the window that has to be covered for a comparison."""
 PART_M: Final = 0.2
 FLOOR_M: Final = 0.08
 PART_RAD: Final = 0.2
 FLOOR_RAD: Final = 0.1
-"""Allowed disagreement: a part of the motion (slip, scale) and a floor (stamps, and wheels that turn the robot by
-itself: on the recorded drive through the Intel Research Lab half of all windows are 0.03 rad apart, 1 % 0.11)."""
+"""Permitted difference: a share of the motion (slip, scale) and a minimum (stamps, and odometry that rotates the robot
+by itself). On the recorded drive through the Intel Research Lab, half of all windows differ by 0.03 rad, 1 % by 0.11.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionComparison:
-    """The motion over some ``seconds`` as the ``laser`` and as the ``wheels`` tell it: T_then_now, (x, y, yaw)."""
+    """Motion over some ``seconds`` by ``laser`` and by ``wheels`` (odometry): T_then_now, (x, y, yaw) in m, m, rad."""
 
     seconds: float
     laser: Array
@@ -36,13 +38,13 @@ class MotionComparison:
 
     @property
     def apart(self) -> tuple[float, float]:
-        """By how much they differ, m and rad."""
+        """Difference of the two motions, m and rad."""
         dx, dy, dyaw = se2.between(self.laser, self.wheels).tolist()
         return math.hypot(dx, dy), abs(dyaw)
 
     @property
     def agree(self) -> bool:
-        """Whether that is no more than slip and stamps explain."""
+        """Whether slip and stamp errors explain the difference."""
         away_m, away_rad = self.apart
         way = max(math.hypot(*self.laser[:2].tolist()), math.hypot(*self.wheels[:2].tolist()))
         turned = max(abs(float(self.laser[2])), abs(float(self.wheels[2])))
@@ -52,7 +54,7 @@ class MotionComparison:
 
 @dataclass(slots=True, eq=False)
 class _Seen:
-    """A pose of the laser; the ``wheels``' own at that instant once it was asked for, which nothing changes later."""
+    """One lidar pose; ``wheels``: the odometry's pose at that instant, constant once it is computed."""
 
     t_mono: float
     T_odom_base: Array
@@ -60,7 +62,7 @@ class _Seen:
 
 
 class MotionConsistency:
-    """Compares both motions; holds a few seconds of poses and nothing else."""
+    """Compares both motions; stores a few seconds of poses and nothing else."""
 
     def __init__(self) -> None:
         self._wheels: deque[tuple[float, Array]] = deque()
@@ -68,12 +70,12 @@ class MotionConsistency:
         self._T_start_base = se2.identity()
 
     def restart(self) -> None:
-        """Forget the window: the odometry has jumped, or a person has moved the pose."""
+        """Clear the window: the odometry has jumped, or an operator has set the pose."""
         self._wheels.clear()
         self._laser.clear()
 
     def on_odometry(self, record: Odometry) -> None:
-        """Take in one increment of the wheels."""
+        """Add one odometry increment."""
         if not self._wheels:
             self._wheels.append((record.t_begin, self._T_start_base))
         self._T_start_base = se2.compose(self._T_start_base, record.delta)
@@ -82,7 +84,7 @@ class MotionConsistency:
             self._wheels.popleft()
 
     def on_match(self, t_mono: float, T_odom_base: Array, complete: bool) -> None:
-        """Take in the laser's pose at one scan; ``complete``: the match is good and fixed every axis."""
+        """Add the lidar's pose at one scan; ``complete``: the match is good and fixed every axis."""
         if not complete:
             self._laser.clear()
             return
@@ -91,12 +93,12 @@ class MotionConsistency:
             self._laser.popleft()
 
     def agree(self) -> bool | None:
-        """Whether both told the same motion over the window; None while that cannot be said."""
+        """Whether both motions over the window agree; None while not available."""
         told = self.compared()
         return None if told is None else told.agree
 
     def compared(self) -> MotionComparison | None:
-        """What both told over the window; None while that cannot be said."""
+        """Both motions over the window; None while not available."""
         span = self._span()
         if span is None:
             return None
@@ -106,7 +108,7 @@ class MotionConsistency:
         return MotionComparison(new.t_mono - old.t_mono, laser, wheels)
 
     def _span(self) -> tuple[_Seen, _Seen] | None:
-        """Oldest and newest laser pose inside the window for which the wheels have spoken too."""
+        """Oldest and newest lidar pose inside the window for which odometry is available."""
         if not self._wheels:
             return None
         first, last = self._wheels[0][0], self._wheels[-1][0]
@@ -118,13 +120,13 @@ class MotionConsistency:
         return oldest, newest
 
     def _wheels_at(self, seen: _Seen) -> Array:
-        """The wheels' pose at the instant of a laser pose; looked up once, while it is among the newest."""
+        """Odometry pose at the instant of a lidar pose; interpolated once, while it is in the recent history."""
         if seen.wheels is None:
             seen.wheels = self._wheel_pose(seen.t_mono)
         return seen.wheels
 
     def _wheel_pose(self, t_mono: float) -> Array:
-        """The wheels' pose at an instant inside their history, at constant twist between two readings."""
+        """Odometry pose at an instant inside its history, at constant twist between two readings."""
         t_new, T_new = self._wheels[-1]
         for t_old, T_old in reversed(self._wheels):
             if t_old < t_mono:

@@ -1,4 +1,4 @@
-"""Turns what a cycle has seen (step result, device status, odometry) into evidence for the state machine."""
+"""Evidence observer: derives the state machine's evidence from step result, device status and odometry of a cycle."""
 
 from __future__ import annotations
 
@@ -32,30 +32,30 @@ from estimator import (
 from hal.lidar import LidarStatus, Link
 
 ENOUGH_INLIERS: Final = 0.4
-"""Part of the beams that has to find its place in the map for a match to count as good."""
+"""Smallest share of inlier beams of a good match."""
 OPENING_S: Final = 10.0
-"""A lidar that has not delivered this long after the start is said to be unreachable, whatever its driver is doing."""
+"""Time in s after the start without a scan from which the lidar is unreachable, whatever its driver's status."""
 LIGHT_SILENT_S: Final = 1.0
-"""Samples that have not arrived for this long are missing; blocks come twenty times a second."""
+"""Time in s without samples after which they have timed out; blocks arrive twenty times a second."""
 GUESS_S: Final = 0.5
-"""A velocity carries the pose along an axis that nothing shows for this long; after that the pose is a guess there."""
+"""Time in s for which the velocity predicts an axis that no measurement determines; after that it is unconfirmed."""
 TELLING: Final = (LoopReason.PLACED, LoopReason.LIT)
-"""Loops that tell the place of a robot that may have been carried off."""
+"""Reasons of loops that determine the pose of a robot that may have been kidnapped."""
 SEVERAL: Final = 3
-"""Lamps by which light can find a place anew."""
+"""Smallest number of lamps from which light can find a pose again."""
 EARLY: Final = 0.01
-"""Part of a scan period by which a timer may be early and still stand for the whole period."""
+"""Share of a scan period by which a timer may be early and still stand for the whole period."""
 
 
 class Observer:
-    """Watches the cycles go by. Its memory: witnesses, when devices last spoke, what was known when all was known.
+    """Derives evidence from consecutive cycles; it stores times of arrivals and when each axis was last confirmed.
 
     Attributes:
-        unused: why the laser is left out though it is there, set by the cycle; None: it is used.
+        unused: reason why an available lidar is skipped, set by the cycle; None: it is used.
     """
 
     def __init__(self, t_mono: float, odometry: bool, lidar: bool = True, lights: bool = False) -> None:
-        """Start watching; ``odometry``, ``lidar``, ``lights``: which inputs are configured."""
+        """Start at ``t_mono``; ``odometry``, ``lidar``, ``lights``: which inputs are configured."""
         self.motion_consistency = MotionConsistency()
         self.unused: Cause | None = None
         self._lidar, self._lights = lidar, lights
@@ -80,29 +80,29 @@ class Observer:
     def odometry_ok(self, t_mono: float, latest: float | None = None) -> bool | None:
         """Whether odometry is arriving; None where none is configured.
 
-        ``latest``: when the latest reading arrived, which no cycle may have taken yet.
+        ``latest``: arrival of the latest reading, which may still wait for a cycle.
         """
         latest = self._t_odometry if latest is None else max(self._t_odometry, latest)
         return t_mono - latest <= ODOMETRY_SILENT_S if self._odometry else None
 
     def silence(self, t_mono: float, period: float) -> float | None:
-        """Scan periods since the last scan was taken; None before the first."""
+        """Scan periods since the last received scan; None before the first."""
         return None if self._t_scan is None else (t_mono - self._t_scan) / period
 
     def on_scan(self, t_rx: float) -> None:
-        """A valid scan has arrived."""
+        """Register a valid scan."""
         self._t_scan = t_rx
         self._unreachable = False
 
     def on_odometry(self, t_rx: float) -> None:
-        """A valid odometry reading has arrived."""
+        """Register a valid odometry reading."""
         self._odometry = True
         self._t_odometry = t_rx
 
     def evidence(
         self, t_mono: float, period: float, status: LidarStatus, records: tuple[Record, ...], result: StepResult | None
     ) -> Evidence:
-        """What one cycle adds; call it once per cycle with everything the cycle consumed."""
+        """Evidence of one cycle; call it once per cycle with everything the cycle consumed."""
         for record in records:
             if isinstance(record, Odometry):
                 self.motion_consistency.on_odometry(record)
@@ -118,7 +118,9 @@ class Observer:
             sigma_m, sigma_rad = self._sigma(match, result, ordered, self.odometry_ok(t_mono))
         silence = self.silence(t_mono, period)
         late = self._t_scan is None and t_mono - self._t_start > OPENING_S
-        self._unreachable |= status.link is Link.WAITING or late  # until a scan: an attempt more is no news
+        self._unreachable |= (
+            status.link is Link.WAITING or late
+        )  # set until a scan arrives: one more attempt of the driver changes nothing
         return Evidence(
             t_mono=t_mono,
             silence=None if silence is None else silence + EARLY * SILENT_PERIODS,
@@ -139,25 +141,25 @@ class Observer:
         )
 
     def _take_orders(self, records: tuple[Record, ...]) -> bool:
-        """Whether a person has ordered something; where the robot was last is remembered until it is found."""
+        """Whether an operator command came; the previous run's stored pose is kept until relocalisation uses it."""
         commands = [record for record in records if isinstance(record, Command)]
         for command in commands:
             self._remembered = command.T_map_base if command.order is Order.REMEMBERED else None
         return any(command.order is not Order.REMEMBERED for command in commands)
 
     def _recalled(self, result: StepResult | None) -> bool:
-        """Whether the robot has just been found in the whole map, and where the run before has left it."""
+        """Whether relocalisation has just found the pose, and it equals the stored pose of the previous run."""
         remembered = self._remembered
         if result is None or result.loop is None or result.loop.reason is not LoopReason.PLACED or remembered is None:
             return False
-        from estimator import near  # the estimator has been loaded, by the warm-up
+        from estimator import near  # the warm-up has loaded the estimator
 
         self._remembered = None
         T_map_base = se2.compose(result.T_map_odom, result.T_odom_base)
         return near(remembered, T_map_base)
 
     def _light(self, t_mono: float, result: StepResult | None) -> Light:
-        """What light says in this cycle; a cycle without a step repeats nothing but the silence."""
+        """Evidence from light; in a cycle without a step it contains only the timeout and the last known axes."""
         alive = t_mono - self._t_samples <= LIGHT_SILENT_S
         if result is None or result.lights is None:
             return Light(alive, placed=self._placed, known=self._known)
@@ -181,7 +183,7 @@ class Observer:
         )
 
     def _elsewhere(self, misplaced: bool, t_epoch: float) -> bool:
-        """Whether a second epoch in a row has what cannot be received at the pose: who walks by adds no light."""
+        """Whether two consecutive epochs have links impossible at the pose; a passing person adds no light."""
         if not misplaced:
             self._t_misplaced = None
         elif self._t_misplaced is None:
@@ -199,19 +201,21 @@ class Observer:
             return None
         off_m, off_rad = math.hypot(*found.correction[:2].tolist()), abs(float(found.correction[2]))
         match = Match(good(found), _axes(result.known_axes), off_m, off_rad)
-        laser = found.known_axes if result.placed else result.known_axes  # what light has shown is no echo of the laser
+        laser = (
+            found.known_axes if result.placed else result.known_axes
+        )  # axes that light determines are independent of the lidar
         self.motion_consistency.on_match(result.t_mono, result.T_odom_base, match.good and all(_axes(laser)))
         return match
 
     def _without_guesses(self, match: Match, result: StepResult, t_mono: float, ordered: bool) -> Match:
-        """The match with the axes taken back along which the map itself was laid upon a guess.
+        """The match without the axes along which the map itself was extended at an unconfirmed pose.
 
-        Without odometry, along an axis that no match shows, the pose is only carried on by its last velocity. A
-        keyframe laid then is out of place for good, and every later scan fits it perfectly: what such a match shows
-        is the place in the surroundings, not in the map. A loop closure ends that, an order, and light that agrees.
-        The same is true, along every axis, of a map that was begun anew because nothing fitted the old one: the robot
-        may have been carried off, so that a loop found near where it is taken to be tells nothing. That ends with a
-        place that was looked for everywhere, or that light confirms.
+        Without odometry, the velocity alone predicts the pose along an axis that no match determines. A keyframe
+        created then stays displaced, and every later scan fits it perfectly. Such a match shows the position in the
+        surroundings, not in the map. A loop closure, an operator command or light that agrees ends this condition.
+        The same applies to every axis of a map that was restarted because no scan fitted the old one. The robot may
+        have been kidnapped, so a loop near the predicted pose confirms nothing. This ends with a pose found by a search
+        of the whole map, or confirmed by light.
         """
         told = ordered or _lit(result)
         if told or (result.loop is not None and (not self._begun or result.loop.reason in TELLING)):
@@ -233,12 +237,12 @@ class Observer:
     def _sigma(
         self, match: Match | None, result: StepResult | None, ordered: bool, odometry: bool | None
     ) -> tuple[float, float]:
-        """Uncertainty gained by motion that nothing has witnessed: larger axis in m, heading in rad.
+        """Uncertainty gained by motion that no measurement confirmed: larger axis in m, heading in rad.
 
-        Not the covariance itself: that of a pose in the map grows with the way from the start, while the place in the
-        surroundings is as good as ever. What grows between two complete matches is drift where odometry bridged it.
-        Without odometry it is a guess, and a guess stays one when later scans fit a map that was laid upon it: then
-        the uncertainty is only gone when the estimate itself has become certain again.
+        It is not the covariance itself: that of a pose in the map grows with the distance from the start, while the
+        position in the surroundings stays accurate. With odometry, the growth between two complete matches is drift.
+        Without odometry it is a prediction, and it stays one when later scans fit a map that was extended with it. Then
+        the uncertainty ends only when the covariance itself is small again.
         """
         if result is None:
             return 0.0, 0.0
@@ -254,13 +258,13 @@ class Observer:
 
 
 def _lit(result: StepResult) -> bool:
-    """Whether light tells a place and the pose agrees."""
+    """Whether the light solution is good and agrees with the pose."""
     agrees = result.placed and result.gap is not None and result.gap <= SURPRISE
     return agrees and result.lights is not None and result.lights.fix is Fix.GOOD
 
 
 def _nearly(lights: LightsResult) -> bool:
-    """Whether light has a place that it is not sure of yet, by several lamps and no vaguer than a pose may be."""
+    """Whether the light solution has not converged, but has several lamps and a position sigma below the limit."""
     spread = float(lights.covariance[0, 0] + lights.covariance[1, 1])
     return lights.fix is Fix.STARTING and len(lights.accepted) >= SEVERAL and spread < 2.0 * VAGUE_M**2
 
@@ -271,13 +275,13 @@ def _axes(known: Array) -> tuple[bool, bool, bool]:
 
 
 def _contradicts(lights: LightsResult) -> bool:
-    """Whether of the lamps more are received that cannot be so at the place light is held to have told, than fit it."""
+    """Whether more received links are inconsistent with the position of the light solution than fit it."""
     fitting = len(lights.accepted) + sum(link.waiting for link in lights.links)
     return sum(link.against for link in lights.links) > fitting
 
 
 def _places(result: StepResult | None) -> int | None:
-    """How many places fit: of the map, or light says that there are several, as long as it has not told which."""
+    """Number of hypotheses: of relocalisation, otherwise of an ambiguous light solution before the map is aligned."""
     if result is not None and result.places is not None:
         return result.places
     if result is None or result.lights is None or result.placed:
@@ -286,13 +290,13 @@ def _places(result: StepResult | None) -> int | None:
 
 
 def _growth(P: Array, before: Array) -> tuple[float, float]:
-    """One-sigma of what a 3x3 covariance has gained: larger axis in m, heading in rad."""
+    """One-sigma of the growth of a 3x3 covariance: larger axis in m, heading in rad."""
     (xx, xy, _), (_, yy, _), (_, _, tt) = (P - before).tolist()
     largest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
     return math.sqrt(max(0.0, largest)), math.sqrt(max(0.0, tt))
 
 
 def good(match: MatchResult) -> bool:
-    """Whether a match is a result that enough of the scan took part in."""
+    """Whether a match is valid, finite, and has enough inliers."""
     finite = all(map(math.isfinite, match.T_odom_base.tolist()))
     return match.ok and match.inliers >= ENOUGH_INLIERS * match.queries and finite

@@ -1,4 +1,4 @@
-"""The position alert: raised while the protection level exceeds the alert limit, or there is none."""
+"""Position alert: raised while the protection level exceeds the alert limit, or is not available."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from daemon.integrity.state_machine import HELD
 from daemon.integrity.state_memory import Memory
 
 CLEAR_S: Final = 1.0
-"""The bound has to be within the limit for this long before the alert is over: it must not chatter."""
+"""Time in s within the limit after which the alert is cleared, so that it does not chatter."""
 SETTLE_S: Final = 10.0
-"""From the first bound of a run on it has this long to come within the limit; an alert before that is not said."""
+"""Time in s from the first protection level of a run in which it may fall below the limit; no alert is reported before.
+"""
 
 log = logging.getLogger(__name__)
 
 
 def bounded(memory: Memory, evidence: Evidence) -> bool:
-    """Whether a bound on the error of the pose can stand: the place is not in doubt.
+    """Whether a protection level is available: it requires a confirmed position.
 
-    A bound assumes that the pose is about right and says how wrong it may be. Nothing of that kind can be said of a
-    place that is being looked for, was lost, was laid upon a guess, that light contradicts or the latest scan does not
-    fit; nor while a heading that is still being found may be any, for where that leads no covariance says.
+    A protection level assumes that the pose is roughly right, and limits its error. It is not available during
+    relocalisation, for a lost or unconfirmed pose, or when light or the latest scan contradicts it. Nor is it available
+    before the heading has converged, because no covariance covers where that leads.
     """
     in_doubt = memory.doubt or memory.failed > 0 or evidence.guessed or evidence.places is not None
     in_doubt = in_doubt or memory.odd_since is not None or _turning(memory, evidence)
@@ -31,21 +32,22 @@ def bounded(memory: Memory, evidence: Evidence) -> bool:
 
 
 def _turning(memory: Memory, evidence: Evidence) -> bool:
-    """Whether the heading in the building is still being found from lamps, and something carries the pose by it."""
+    """Whether the heading in the survey has not converged yet while odometry or lidar moves the pose along it."""
     light, carried = evidence.light, evidence.lidar or evidence.odometry is not None
     return carried and light is not None and light.placed and not (light.known[2] or memory.tracked)
 
 
 class Alarm:
-    """Compares the bound with the limit, cycle by cycle; what changes goes to the log, once.
+    """Compares the protection level with the alert limit in every cycle; each change is logged once.
 
     Args:
-        limit_m: metres, 0: no alert is ever raised.
+        limit_m: alert limit in m, 0: no alert is ever raised.
 
     Attributes:
-        on: the alert is raised. With a limit it is raised until the first bound says otherwise: who knows nothing does
-            not say that all is well. said: it has gone to the log: not before the bound was within the limit, or had
-            the time to get there. Without any bound, as while a place is looked for, state and reason say enough.
+        on: the alert is raised. With a limit it is raised until the first protection level is within it: missing
+            information must not look like a good state. said: it has been logged. It is not logged before the level was
+            within the limit, or had the time to get there. Without a protection level, as during relocalisation, state
+            and reason suffice.
     """
 
     def __init__(self, limit_m: float = 0.0) -> None:
@@ -53,10 +55,10 @@ class Alarm:
         self.on = limit_m > 0.0
         self.said = False
         self._within_since: float | None = None
-        self._expected = math.inf  # when the bound should be within the limit: `t_mono`, seconds
+        self._expected = math.inf  # `t_mono` in s by which the level should be within the limit
 
     def update(self, t_mono: float, bound_m: float | None) -> bool:
-        """Take one cycle's bound (None: there is none) and say whether the alert is raised."""
+        """Update with one cycle's protection level in m (None: not available); return whether the alert is raised."""
         if self.limit_m <= 0.0:
             return False
         if bound_m is not None:

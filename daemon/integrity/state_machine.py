@@ -1,9 +1,9 @@
-"""The published state: one pure state machine, updated once per cycle with evidence.
+"""State machine of the published state: pure functions, updated once per cycle with evidence.
 
-The rule it keeps: TRACKING is only said when two witnesses agree (light and laser about the place, wheel odometry and
-laser about the motion of the last seconds) or when one has proved itself (matches that are good, small and know every
-axis, for a while; light that goes on fitting the place). It is never said of a place that light contradicts.
-Every other state comes with a reason, and a reason comes with a remedy. Bad news counts fast, good news slowly.
+TRACKING requires two solutions that agree, or one that is confirmed by itself, and light must not contradict the pose.
+Light and lidar can agree on the pose; odometry and lidar can agree on the motion of the last seconds. The lidar is
+confirmed by a series of good matches with small corrections on every axis, light by fitting the pose for a while.
+Every other state has a reason, and every reason has a remedy. Degradation takes effect fast, recovery slowly.
 """
 
 from __future__ import annotations
@@ -19,42 +19,42 @@ from daemon.snapshot import State
 
 PROOF_S: Final = 2.0
 PROOF_SCANS: Final = 10
-"""A witness has proved itself after this many good scans in a row that span at least this time."""
+"""Consecutive good scans, over at least this time, that confirm a solution."""
 RELOCATED_PROOF_S: Final = 5.0
-"""The same after the pose was lost: the right place has to be told from a similar one."""
+"""The same time after the pose was lost, s: the right position has to be distinguished from a similar one."""
 CLEAN_S: Final = 1.0
-"""Every axis has to be known for this long before TRACKING is said (again)."""
+"""Every axis has to be known for this long (s) before TRACKING is (re-)entered."""
 DISAGREE_S: Final = 1.0
-"""Disagreement of the witnesses has to last this long: stamps jitter."""
+"""The solutions have to disagree for this long (s), because stamps jitter."""
 LOST_M: Final = 1.0
 LOST_RAD: Final = 0.26
-"""One-sigma uncertainty beyond which a pose is not worth using."""
+"""One-sigma uncertainty beyond which a pose is not usable."""
 RECALLED_S: Final = 0.3
-"""The same where the pose was proved before a gap, or before the daemon ended, and is found again where it was."""
+"""Confirmation time in s where a pose confirmed before a gap, or in the previous run, is found again unchanged."""
 CONTRADICTED_S: Final = 0.3
-"""Light has to contradict the place for this long: an epoch may be spoiled by who walks by."""
+"""Light has to contradict the pose for this long (s): passing people may spoil one epoch."""
 HELD: Final = (State.TRACKING, State.DEGRADED)
-"""States in which a proved pose is held."""
+"""States with a confirmed pose."""
 
 
 def judge(memory: Memory, evidence: Evidence) -> Memory:
-    """Take in one cycle's evidence; ``state``, ``reason`` and ``known`` of the answer are what is published."""
+    """Update the memory with one cycle's evidence; ``state``, ``reason`` and ``known`` of the result are published."""
     if evidence.ordered:
         memory = Memory(memory.state, memory.reason)
     memory = remember(memory, evidence)
     state, reason = _say(memory, evidence)
     lost = state is State.LOST or (memory.lost and state in (State.RELOCATING, State.AMBIGUOUS, State.NO_LIDAR))
     doubt = lost or evidence.places is not None or (memory.doubt and state is not State.TRACKING)
-    recalled = memory.recalled and state is not State.TRACKING  # it has served
+    recalled = memory.recalled and state is not State.TRACKING  # TRACKING ends its purpose
     tracked = state is State.TRACKING or (memory.tracked and not (lost or doubt))
     said = (state, reason, lost, doubt, recalled, tracked)
     if said == (memory.state, memory.reason, memory.lost, memory.doubt, memory.recalled, memory.tracked):
-        return memory  # making a new one costs more than looking whether it is one
+        return memory  # a new struct costs more than this comparison
     return replace(memory, state=state, reason=reason, lost=lost, doubt=doubt, recalled=recalled, tracked=tracked)
 
 
 def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
-    """The table, gravest first."""
+    """State and reason from the decision table, gravest first."""
     if evidence.silence is None or evidence.silence >= SILENT_PERIODS or not steady(memory, evidence.t_mono):
         return _say_without_laser(memory, evidence)
     if evidence.places is not None:
@@ -74,10 +74,10 @@ def _say(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
 
 
 def _say_unused(memory: Memory, evidence: Evidence, why: Reason) -> tuple[State, Reason]:
-    """The part of the table for a laser that is there and left out: light and odometry carry the pose, or nothing.
+    """Part of the table for an available lidar that is skipped: light and odometry determine the pose, or nothing.
 
-    Where the place is lost during a pause, what is to be done is to let the laser in again, not to drive on. A computer
-    that is too slow is told by a fault of its own, and must not hide what a lost place asks for.
+    If the pose is lost during a pause, the remedy is to end the pause, not to drive on. A computer that is too slow has
+    a fault of its own, which must not hide the remedy for a lost pose.
     """
     if memory.lost:
         return State.LOST, _why_lost(memory, why)
@@ -90,14 +90,14 @@ def _say_unused(memory: Memory, evidence: Evidence, why: Reason) -> tuple[State,
 
 
 def _why_lost(memory: Memory, why: Reason) -> Reason:
-    """The reason of a place that was lost before: that of then, or by a pause, which is to be ended."""
+    """Reason of a pose that was lost before: the earlier one, or the pause, which has to end."""
     if why is Reason.PAUSED:
         return why
     return memory.reason if memory.state is State.LOST and memory.reason is not Reason.PAUSED else Reason.NO_WITNESS
 
 
 def _say_without_laser(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
-    """The part of the table for a laser that is silent or not there: light may hold the pose."""
+    """Part of the table for a lidar that has timed out or is not fitted: light may determine the pose."""
     light = evidence.light
     if light is not None and light.placed:
         return _say_of_light(memory, evidence, light)
@@ -116,7 +116,7 @@ def _lidar_gone(evidence: Evidence) -> Reason:
 
 
 def _say_of_light(memory: Memory, evidence: Evidence, light: Light) -> tuple[State, Reason]:
-    """The part of the table for a pose that light and odometry hold without a laser."""
+    """Part of the table for a pose from light and odometry without a lidar."""
     if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
         return _say_vague(light)
     if light.lost or _contradicted(memory, evidence):
@@ -139,7 +139,7 @@ def _say_of_light(memory: Memory, evidence: Evidence, light: Light) -> tuple[Sta
 
 
 def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
-    """The part of the table for a pose that is held: is it lost, degraded, unproved or good."""
+    """Part of the table for a pose from the lidar: lost, degraded, unconfirmed or good."""
     if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
         return _say_vague(evidence.light)
     if evidence.light is not None and evidence.light.lost:
@@ -170,14 +170,14 @@ def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
 
 
 def _say_vague(light: Light | None) -> tuple[State, Reason]:
-    """A pose too uncertain to be used: lost, unless light is just finding it."""
+    """State of a pose with a sigma above its threshold: lost, unless light is about to find it."""
     if light is not None and light.alive and light.placed and light.agrees:
         return State.RELOCATING, Reason.UNPLACED
     return State.LOST, Reason.UNCERTAIN
 
 
 def _missing(memory: Memory, evidence: Evidence) -> Reason | None:
-    """Which configured witness has fallen silent, if any."""
+    """Reason for the first configured input that has timed out; None if all are available."""
     light = evidence.light
     if light is not None and not light.alive:
         return Reason.LIGHT_SILENT
@@ -194,25 +194,25 @@ def _contradicted(memory: Memory, evidence: Evidence) -> bool:
 
 
 def _together(memory: Memory, evidence: Evidence) -> bool:
-    """Whether pose and light have come to each other for good, or had when TRACKING was last said of this place."""
+    """Whether pose and light have agreed for long enough, or TRACKING was reached at this position before."""
     return memory.tracked or memory.apart_last is None or evidence.t_mono - memory.apart_last >= CLEAN_S
 
 
 def _clean(memory: Memory, evidence: Evidence) -> bool:
-    """Good scans in a row that know every axis, for long enough not to flicker."""
+    """Whether consecutive good scans determine every axis for long enough not to flicker."""
     return memory.good >= PROOF_SCANS and all(memory.known) and evidence.t_mono - memory.known_since >= CLEAN_S
 
 
 def _proved(memory: Memory, evidence: Evidence) -> bool:
-    """Whether the laser has proved itself."""
+    """Whether the lidar is confirmed by itself."""
     seconds = RELOCATED_PROOF_S if memory.doubt else PROOF_S
     return _clean(memory, evidence) and evidence.t_mono - memory.good_since >= seconds
 
 
 def _agreed(memory: Memory, evidence: Evidence) -> bool:
-    """Whether two witnesses tell the same motion, or place; the motion says nothing about a place in doubt.
+    """Whether two solutions agree on the motion or the pose. Motion confirms nothing while the position is in doubt.
 
-    What was known before a gap is one of them: the pose is found again where it was left.
+    A confirmed pose from before a gap counts as one of them, if the pose is found again there.
     """
     light = evidence.light
     if memory.recalled and not memory.doubt and all(memory.known):

@@ -1,4 +1,4 @@
-"""What the state machine remembers from cycle to cycle. Bad news counts fast, good news slowly."""
+"""Memory of the state machine between cycles: hysteresis counters and times. It degrades fast and recovers slowly."""
 
 from __future__ import annotations
 
@@ -13,57 +13,57 @@ from daemon.integrity.evidence import SILENT_PERIODS, Evidence, Light, Match
 from daemon.snapshot import State
 
 FAILED_SCANS: Final = 3
-"""Matches in a row that may fail before it is said; one bad scan among people is no news."""
+"""Consecutive failed matches that are tolerated: one bad scan among people is normal."""
 AXIS_LOST_SCANS: Final = 3
 AXIS_LOST_S: Final = 0.3
 AXIS_FOUND_SCANS: Final = 5
-"""Scans in a row, over at least this time, after which an axis changes between known and unknown: what moved in a
-tenth of a second is millimetres, and says nothing about the pose."""
+"""Consecutive scans, over at least this time, after which an axis changes between known and unknown. Motion within a
+tenth of a second is millimetres and does not affect the pose."""
 HELD_S: Final = 1.0
-"""Without odometry a pose is held by its last velocity for this long after the last good match, then it is lost."""
+"""Time in s without odometry for which the velocity predicts the pose after the last good match; then it is lost."""
 DARK_S: Final = 5.0
-"""Light that tells nothing for this long is a witness that is missing: the way between two lamps is shorter."""
+"""Time in s after which a missing light solution counts: the way between two lamps takes less."""
 
 
 BLIND_S: Final = 60.0
-"""A robot that nothing watches for longer may have been carried off, and put down where it looks alike."""
+"""Time in s without measurements after which the robot may have been kidnapped to a place of similar appearance."""
 THERE_M: Final = 0.15
 THERE_RAD: Final = 0.06
-"""A pose that was proved is found again where it was taken to be: the first match moves it by no more than this."""
+"""Largest correction by the first match at which a confirmed pose counts as found again."""
 
 
 AGAIN_S: Final = 3.0
-"""A laser that falls silent again so soon after it was said to be back is one that comes and goes."""
+"""Time in s within which the next timeout of the lidar after its recovery counts as intermittent."""
 STEADY_S: Final = 0.8
-"""It is said to be back when no silence has come for this long: a pose that was sure is proved by then."""
+"""Time in s without a timeout after which the lidar has recovered: a pose that was certain is confirmed by then."""
 OFTEN: Final = 6
-"""So many times in a row are no bad moment but a loose plug."""
+"""Number of intermittent timeouts in a row that indicate a loose plug."""
 STEADIEST_S: Final = 3.2
-"""Such a laser is said to be back only then; longer than `AGAIN_S`: gaps at a steady pace end with one word."""
+"""Recovery time in s of such a lidar; longer than `AGAIN_S`, so that periodic gaps cause one report only."""
 
 
 Streak = tuple[int, float]
-"""How many in a row, and when it began."""
+"""Number of consecutive scans, and the time of the first."""
 
 
 class Memory(msgspec.Struct, frozen=True):
-    """What the machine remembers between cycles; start with ``Memory()``. A struct: every cycle makes new ones.
+    """State of the state machine between cycles; start with ``Memory()``. A struct: every cycle makes new ones.
 
     Attributes:
-        good, good_since: good scans in a row and when the first of them was. failed: failed scans in a row.
-        good_last: when a match was last good.
-        axes: per axis, scans in a row that say otherwise than what is shown, and when the first of them did.
-        known: the axes as shown. known_since: when the last of them became known.
-        disagree_since: None while the witnesses do not disagree.
-        doubt: the place itself has to be proved again, because nothing told the motion for a while.
-        lost: the pose was given up and is not confirmed yet; implies ``doubt``.
-        sure: the pose was proved when the laser fell silent. recalled: the laser is back, and has found it there.
-        lit_since: since when light has told the place without a pause of `DARK_S`. lit_last: when it last did.
-        odd_since: since when light has contradicted the place; both None while it does not.
-        tracked: TRACKING has been said of this place before. apart_last: when pose and light last were apart.
-        led: light has moved the pose, and has not been sure of the place since.
-        gone: the laser is silent. back: when it last came back, None: it has not been away. fitful: how often in a row
-            it has fallen silent again soon after it was said to be back.
+        good, good_since: consecutive good scans and the time of the first. failed: consecutive failed scans.
+        good_last: time of the latest good match.
+        axes: per axis, consecutive scans that differ from the shown value, and the time of the first.
+        known: the axes as published. known_since: when the last of them became known.
+        disagree_since: None while the solutions do not disagree.
+        doubt: the position needs confirmation again, because no measurement determined the motion for a while.
+        lost: the pose was abandoned and is not confirmed yet; implies ``doubt``.
+        sure: the pose was confirmed when the lidar timed out. recalled: the lidar has recovered and found it there.
+        lit_since: start of the present light solution without a gap of `DARK_S`. lit_last: its latest time.
+        odd_since: start of the present contradiction by light; None while there is none.
+        tracked: TRACKING was reached at this position before. apart_last: latest time when pose and light disagreed.
+        led: light has moved the pose, and has not confirmed it since.
+        gone: the lidar has timed out. back: its latest recovery, None: it was never away. fitful: number of consecutive
+            timeouts soon after a reported recovery.
     """
 
     state: State = State.STARTING
@@ -92,7 +92,7 @@ class Memory(msgspec.Struct, frozen=True):
 
 
 def remember(memory: Memory, evidence: Evidence) -> Memory:
-    """Take in one cycle's evidence."""
+    """Update the memory with one cycle's evidence."""
     now = evidence.t_mono
     memory = _odd(memory, None) if evidence.light is None else _take_light(memory, evidence.light, now)
     silent = evidence.silence is not None and evidence.silence >= SILENT_PERIODS
@@ -105,7 +105,7 @@ def remember(memory: Memory, evidence: Evidence) -> Memory:
     if since_or_none is not memory.disagree_since:
         memory = replace(memory, disagree_since=since_or_none)
     if evidence.places is not None:
-        # what fits the surroundings proves nothing of the place in the map
+        # a fit to the surroundings does not confirm the pose in the map
         memory = replace(memory, good=0, sure=False, recalled=False)
     if evidence.recalled:
         memory = replace(memory, recalled=True, doubt=False)
@@ -115,30 +115,30 @@ def remember(memory: Memory, evidence: Evidence) -> Memory:
 
 
 def steady(memory: Memory, now: float) -> bool:
-    """Whether the laser can be said to be there: one that comes and goes must not take what is said along."""
+    """Whether the lidar counts as available; an intermittent one must not make the state alternate."""
     if not memory.fitful:
         return True
     return not memory.gone and memory.back is not None and now - memory.back >= _hold(memory)
 
 
 def _hold(memory: Memory) -> float:
-    """Seconds without a silence after which the laser is said to be back."""
+    """Time in s without a timeout after which the lidar counts as recovered."""
     if not memory.fitful:
         return 0.0
     return STEADY_S if memory.fitful < OFTEN else STEADIEST_S
 
 
 def _gone(memory: Memory, now: float) -> Memory:
-    """The laser has fallen silent."""
+    """Update at a timeout of the lidar."""
     there = math.inf if memory.back is None else now - memory.back - _hold(memory)
     if there >= AGAIN_S:
         return replace(memory, gone=True, fitful=0)
-    said = there >= 0.0  # else nobody has heard that it was back
+    said = there >= 0.0  # otherwise its recovery was never reported
     return replace(memory, gone=True, fitful=memory.fitful + said)
 
 
 def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
-    """What is left of the memory while the laser is silent or not used; a pose that nothing carried on is in doubt."""
+    """Memory while the lidar is timed out or not used; a pose without any other motion source is in doubt."""
     now, light = evidence.t_mono, evidence.light
     carried = evidence.odometry or (light is not None and light.used)
     blind = not carried and memory.good_last is not None and now - memory.good_last > HELD_S
@@ -161,14 +161,14 @@ def _forget_laser(memory: Memory, evidence: Evidence) -> Memory:
 
 
 def _sure(memory: Memory, watched: bool) -> bool:
-    """Whether the pose was proved when the laser fell silent, or left out, and nobody can have carried it off since."""
+    """Whether the pose was confirmed when the lidar timed out or was skipped, and kidnapping since is excluded."""
     held = memory.state is State.TRACKING or (memory.state is State.DEGRADED and memory.good > 0 and all(memory.known))
     proved = held and not (memory.doubt or memory.lost)
     return (proved or memory.sure or memory.recalled) and watched
 
 
 def _take_light(memory: Memory, light: Light, now: float) -> Memory:
-    """Remember since when light has told the place, and since when it has contradicted the pose."""
+    """Update the times since which light determines the pose and since which it contradicts the pose."""
     odd = light.agrees is False
     memory = _odd(memory, (now if memory.odd_since is None else memory.odd_since) if odd else None)
     if light.apart:
@@ -182,12 +182,12 @@ def _take_light(memory: Memory, light: Light, now: float) -> Memory:
         return replace(memory, lit_since=now if begun else memory.lit_since, lit_last=now, led=led)
     held = memory.state is State.TRACKING and not (memory.doubt or memory.led)
     if light.fits and light.placed and not odd and held:
-        return replace(memory, lit_last=now)  # a second witness finds the pose that is held: that is not dark
+        return replace(memory, lit_last=now)  # a second solution confirms the pose, so light counts as present
     return memory
 
 
 def _odd(memory: Memory, since: float | None) -> Memory:
-    """Since when light has contradicted the pose; making a new memory costs more than looking whether it is one."""
+    """Set the start of the contradiction by light; a new struct costs more than the comparison before it."""
     return memory if since is memory.odd_since else replace(memory, odd_since=since)
 
 
@@ -225,7 +225,7 @@ def _take_good(memory: Memory, match: Match, now: float) -> Memory:
 
 
 def _axis(shown: bool, streak: Streak, seen: bool, now: float) -> tuple[bool, Streak]:
-    """One axis' hysteresis: what is shown, and the streak of scans that say otherwise."""
+    """Hysteresis of one axis: the shown value, and the streak of scans that differ from it."""
     if seen == shown:
         return shown, (0, 0.0)
     count, since = streak[0] + 1, streak[1] if streak[0] else now

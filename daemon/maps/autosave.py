@@ -1,8 +1,7 @@
-"""Saves the map while the robot drives: on a schedule, when asked, and at the stop.
+"""Map autosave: saves the map on a schedule, on command and at the stop, in a thread of its own.
 
-The loop's thread only gathers references (`estimator.stored_map.image_of`). Packing and writing is for a
-thread of its own, which lets the loop in between slices of a fraction of a millisecond: Python's lock is held by one of
-them at a time.
+The loop's thread only collects references (`estimator.stored_map.image_of`). The thread packs and writes, and pauses
+between slices of a fraction of a millisecond. Only one of the two can hold the interpreter lock at a time.
 """
 
 from __future__ import annotations
@@ -28,23 +27,23 @@ from daemon.system.versions import release
 from hal.blocking_calls import run_in_thread
 from hal.clock import Clock
 
-if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+if TYPE_CHECKING:  # the warm-up loads the estimator in a thread
     from estimator import MapImage, State
 
 log = logging.getLogger(__name__)
 
 BEAT_S: Final = 1.0
 FIRST_S: Final = 60.0
-"""A map that has grown for a minute is worth keeping."""
+"""Time in s to the first save: a map that has grown for a minute is worth storing."""
 EVERY_S: Final = 300.0
-"""And every five minutes: what a power cut costs is mapped again on the next pass, and memory cards wear."""
+"""Interval of later saves, s. What a power cut loses is mapped again on the next pass, and memory cards wear."""
 RETRY_S: Final = 60.0
 LOOK_S: Final = 10.0
-"""A folder that could not be taken at the start is tried so often, whether there is something to be saved or not."""
+"""Interval in s of attempts to lock a folder that could not be locked at the start, whether a save is due or not."""
 BREATH_S: Final = 0.0005
-"""Pause between two slices of packing."""
+"""Pause between two slices of packing, s."""
 STOP_S: Final = 4.0
-"""What the save at the stop may take; the service manager waits for ten seconds."""
+"""Time limit in s of the save at the stop; the service manager waits for ten seconds."""
 
 DONE: Final = ""
 NO_MAP: Final = "there is no map yet: drive a metre or two"
@@ -54,15 +53,15 @@ ADRIFT: Final = "the place in the stored map is not known yet, and the map has n
 
 Revision = tuple[int, int, int]
 End = Callable[[Path | None, str], None]
-"""Takes the end of a save in the loop's thread: the file, or None and why there is none."""
+"""Completion callback of a save, in the loop's thread: the file, or None and the reason of the failure."""
 
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What is said of every map of a run.
+    """Metadata of every map of a run.
 
     Attributes:
-        robot: name of the configuration. survey: digest of the lamps' survey, empty without. localise: never saved.
+        robot: name of the configuration. survey: digest of the lamp survey, empty without. localise: never saved.
     """
 
     robot: str = ""
@@ -71,11 +70,11 @@ class About:
 
 
 class MapAutosaver:
-    """Keeps the map of a running estimator.
+    """Saves the map of a running estimator.
 
     Attributes:
-        error: why the latest save came to nothing, empty while all is well. saves: so far.
-        busy_since: when the save began that is under way (`time.monotonic`), None: there is none.
+        error: reason why the latest save failed, empty on success. saves: number so far.
+        busy_since: start of the save in progress (`time.monotonic`, s), None: none.
     """
 
     def __init__(
@@ -87,7 +86,7 @@ class MapAutosaver:
         about: About,
         clock: Clock,
     ) -> None:
-        """Nothing happens before :meth:`run`. ``state``: None while the estimator is loaded."""
+        """Nothing starts before :meth:`run`. ``state``: None while the estimator is loaded."""
         self.error = "" if store is None else store.trouble
         self.saves = 0
         self.busy_since: float | None = None
@@ -105,7 +104,7 @@ class MapAutosaver:
 
     @property
     def fault(self) -> bool:
-        """Whether the map cannot be kept."""
+        """Whether the map cannot be saved."""
         return bool(self.error)
 
     @property
@@ -115,7 +114,7 @@ class MapAutosaver:
 
     @property
     def ready(self) -> bool:
-        """Whether the estimator has been loaded."""
+        """Whether the estimator is loaded."""
         return self._state() is not None
 
     @property
@@ -124,24 +123,24 @@ class MapAutosaver:
         return self._map_id()
 
     def switched(self, map_id: int, start: Start) -> None:
-        """The estimator goes on in another stored map, ``map_id`` from now on, which need not be saved as it is."""
+        """Update after a switch to the stored map ``map_id``; its present content counts as saved."""
         self._start, self._map_of, self._anew = start, map_id, False
         if (state := self._state()) is not None:
             _, news, closures = self._revision(state)
             self._saved = map_id, news, closures
 
     def without_start(self) -> None:
-        """The run begins with no map after all, under another identity; of it, nothing is there to be saved yet."""
+        """Update when the run starts without the stored map, under a new identity: nothing is saved yet."""
         self._start, self._map_of = None, self._map_id()
 
     def loaded(self) -> None:
-        """The estimator can begin: what it begins with need not be saved, but proved to be no start's end."""
+        """Mark the estimator as loaded: the first revision counts as saved, and the start trial begins."""
         state, self._proved_at = self._state(), self._clock.now() + PROOF_S
         if state is not None and self._start is not None:
             self._saved = self._revision(state)
 
     def ask(self, on_done: OnDone) -> None:
-        """Save as soon as possible, and say when it is on the disk, or why not."""
+        """Save as soon as possible; ``on_done`` is called at the end, with the reason of a failure."""
         if reason := self._against():
             on_done(reason)
             return
@@ -149,7 +148,7 @@ class MapAutosaver:
         self._go_on()
 
     def _against(self) -> str:
-        """Why there is nothing to be saved when asked."""
+        """Reason why a requested save has nothing to do; empty otherwise."""
         if self._store is None:
             return NO_FOLDER
         if self._about.localise:
@@ -168,17 +167,17 @@ class MapAutosaver:
             self._go_on()
 
     async def _proved(self) -> None:
-        """The map that the run began with has not ended it."""
+        """Record that the run has outlived the trial period of its first map."""
         self._proved_at, self._lasted = math.inf, True
         if self._store is not None:
-            with contextlib.suppress(RuntimeError):  # no thread: the next start has one less to go
+            with contextlib.suppress(RuntimeError):  # no thread is available: the next start has one attempt less
                 await run_in_thread(self._store.lasted, "map")
 
     async def finish(self, in_order: bool = True) -> None:
-        """Save what has changed since the last time, wait for it, but not for ever.
+        """Save what has changed since the last save, and wait at most :data:`STOP_S` for it.
 
-        ``in_order``: the run ends because somebody wants it. One that a defect ends before it has lasted saves nothing:
-        a service that dies again and again would leave a map each time.
+        ``in_order``: the run was stopped on request. A run that a defect ends within the trial period saves nothing: a
+        service that fails repeatedly would leave a map each time.
         """
         with contextlib.suppress(asyncio.TimeoutError):
             async with asyncio.timeout(STOP_S):
@@ -196,7 +195,7 @@ class MapAutosaver:
             self._store.close()
 
     def _go_on(self) -> None:
-        """Begin a save where one is due and none is under way."""
+        """Start a save if one is due and none is in progress."""
         state, store = self._state(), self._store
         if store is None or self._about.localise or not self._over.is_set():
             return
@@ -206,7 +205,7 @@ class MapAutosaver:
         if state is None:
             return
         revision = self._revision(state)
-        if self._map_id() != self._map_of:  # begun anew, which counts at once: the old map must not come back
+        if self._map_id() != self._map_of:  # a new map is saved at once, so that the old one is not loaded again
             self._start, self._map_of, self._anew, self._due = None, self._map_id(), True, self._clock.now()
         news = self._anew or (revision != self._saved and not empty(state))
         if not (self._waiting or (news and self._clock.now() >= self._due)):
@@ -217,12 +216,12 @@ class MapAutosaver:
         self._busy(True)
         try:
             self._begin(store, state, end)
-        except Exception as failure:  # no memory, no thread, or a defect: whoever waits is told, and it is tried again
+        except Exception as failure:  # no memory, no thread, or a defect: clients get the reason; retried
             log.exception("the save of the map cannot begin")
             end(None, f"the save cannot begin: {failure!r}")
 
     def _busy(self, busy: bool) -> None:
-        """A thread is at the folder from now on, or no more."""
+        """Record whether a thread uses the folder."""
         self.busy_since = time.monotonic() if busy else None
         if busy:
             self._over.clear()
@@ -230,24 +229,24 @@ class MapAutosaver:
             self._over.set()
 
     def _look(self, store: Store) -> None:
-        """Try again to take the folder, in a thread: a disk may hang."""
+        """Try again to lock the folder, in a thread, because a disk may hang."""
         self._look_due = self._clock.now() + LOOK_S
         loop, before = asyncio.get_running_loop(), store.trouble
 
         def work() -> None:
             store.claim()
-            with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
+            with contextlib.suppress(RuntimeError):  # the loop has closed: no client waits any more
                 loop.call_soon_threadsafe(self._looked, store, before)
 
         self._busy(True)
         try:
             threading.Thread(target=work, name="lumiloop-map", daemon=True).start()
-        except Exception:  # no memory, or no thread: the next look is soon
+        except Exception:  # no memory, or no thread: the next attempt comes soon
             log.exception("the folder of maps cannot be looked at")
             self._busy(False)
 
     def _looked(self, store: Store, before: str) -> None:
-        """Back in the loop's thread: what kept the folder from being taken is over, or it is not."""
+        """Handle the result of the locking attempt, in the loop's thread."""
         self._busy(False)
         if self.error == before:
             self.error = store.trouble
@@ -256,7 +255,7 @@ class MapAutosaver:
         self._go_on()
 
     def _begin(self, store: Store, state: State, end: End) -> None:
-        """Gather the map, and have a thread save it, which calls ``end`` in this one."""
+        """Collect the map and start a thread that saves it and calls ``end`` in this one."""
         begun = time.perf_counter()
         image = self._image(state)
         log.debug("the map was gathered in %.2f ms", 1e3 * (time.perf_counter() - begun))
@@ -264,7 +263,7 @@ class MapAutosaver:
         threading.Thread(target=work, name="lumiloop-map", daemon=True).start()
 
     def _revision(self, state: State) -> Revision:
-        """Changes when there is something new to save."""
+        """Revision of the map, which changes when there is something new to save."""
         atlas = state.map.graph
         if (first := state.map.parts.unproved) is not None:
             return self._map_id(), first, -1
@@ -284,7 +283,7 @@ class MapAutosaver:
         return image_of(state, who)
 
     def _work(self, store: Store, image: MapImage, loop: asyncio.AbstractEventLoop, end: End) -> None:
-        """Pack, write, verify; in a thread of its own."""
+        """Pack, write and verify the map, in a thread of its own."""
         path, error = None, DONE
         try:
             path = store.save(self._packed(image), image.identity.map_id)
@@ -292,10 +291,10 @@ class MapAutosaver:
             error = f"{store.folder}: {said(failure)}"
         except BadMap as failure:
             error = f"{store.folder}: {failure}"
-        except Exception as failure:  # a defect in the packing must not end saving for good, and is told in full
+        except Exception as failure:  # a defect in the packing must not end saving for good, and is logged in full
             log.exception("the map cannot be packed")
             error = f"it cannot be packed: {failure!r}"
-        with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
+        with contextlib.suppress(RuntimeError):  # the loop has closed: no client waits any more
             loop.call_soon_threadsafe(end, path, error)
 
     def _packed(self, image: MapImage) -> bytes:
@@ -305,7 +304,7 @@ class MapAutosaver:
         return packed(image, meta, partial(time.sleep, BREATH_S))
 
     def _end(self, revision: Revision, waiting: list[OnDone], path: Path | None, error: str) -> None:
-        """Back in the loop's thread."""
+        """Handle the end of a save, in the loop's thread."""
         self._busy(False)
         self._due = self._clock.now() + (RETRY_S if error else EVERY_S)
         if path is not None:
@@ -314,11 +313,13 @@ class MapAutosaver:
             news = waiting or self.error or self.saves == 1 or self._last
             log.log(logging.INFO if news else logging.DEBUG, "map saved: %s", path)
         else:
-            # tried again, though there may be nothing new: the fault is to end when what was in the way has gone
+            # retry even without a new revision: the fault ends only when a save succeeds
             self._anew |= self._saved is not None and (self._saved == revision or self._saved[0] != self._map_id())
         if error and not self.error:
             again = "" if self._last else ", and it is tried again"
-            log.info("the map cannot be saved: %s; what was saved before stays%s", error, again)  # the fault warns
+            log.info(
+                "the map cannot be saved: %s; what was saved before stays%s", error, again
+            )  # the fault is the warning
         self.error = error
         for on_done in waiting:
             on_done(error)
@@ -327,6 +328,6 @@ class MapAutosaver:
 
 
 def empty(state: State) -> bool:
-    """Whether there is nothing of a map yet: no keyframe, and nothing learned of lamps."""
+    """Whether the map is empty: no keyframe, and no learned lamp gains."""
     learned = state.light is not None and bool(state.light.filter.gains)
     return not (state.map.keyframes or state.map.graph.submaps or learned)

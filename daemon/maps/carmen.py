@@ -1,8 +1,8 @@
-"""Keyframes as a CARMEN log (carmen.sourceforge.net/logger_playback.html): a ``ROBOTLASER1`` line for each scan.
+"""Keyframe export as a CARMEN log (carmen.sourceforge.net/logger_playback.html): one ``ROBOTLASER1`` line per scan.
 
-The format has no place for the time at which a keyframe was laid, and a map that grew over several days has no clock of
-its own. The stamp is the keyframe's number, as though one were laid each second: ascending, unique, and the same in the
-TUM file. Bearings are those seen from the scan's end, so that nothing turns within a scan.
+The format has no field for a keyframe's time, and a map of several days has no clock of its own. The stamp is the
+keyframe's number, as if one were created each second: ascending, unique, and equal to that in the TUM file.
+Bearings are those at the scan's end, so that the robot does not turn within a scan.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ HEAD: Final = (
 )
 HOST: Final = "lumiloop"
 BEYOND_M: Final = 1.0
-"""The maximum range is written as so much beyond the farthest reading: a beam without echo says it."""
+"""Margin in m of the written maximum range above the farthest reading: such a reading means a beam without echo."""
 
 
 def carmen(scans: Iterable[tuple[int, Array, Array, Beams]]) -> bytes:
-    """The log of keyframes: number, T_map_base, T_base_lidar, beams. Free and silent beams both have no return."""
+    """CARMEN log of keyframes: number, T_map_base, T_base_lidar, beams. FREE and NONE beams both have no return."""
     lines = [HEAD]
     for key, T_map_base, T_base_lidar, (bearing, distance, kind) in scans:
         n = len(bearing)

@@ -1,16 +1,16 @@
-"""The container of a map file: named arrays with checksums. Pure: bytes in, bytes out.
+"""Binary container of a map file: named compressed arrays with checksums. Pure: bytes in, bytes out.
 
-Little-endian throughout. A head of 24 bytes, a table with one row of 48 bytes per array, and the arrays, each a chain
-of blocks that are packed by themselves:
+Little-endian throughout: a head of 24 bytes, a table with one row of 48 bytes per array, and the arrays. An array is a
+chain of blocks that are packed separately:
 
-    head    magic (8 bytes), version (u16), arrays (u16), CRC-32 of the table, begun with the version (u32),
+    head    magic (8 bytes), version (u16), arrays (u16), CRC-32 of the table, started with the version (u32),
             length of the file (u64)
     row     name (16 bytes), dtype (4), columns (u32, 0: one-dimensional), rows (u64), packed length (u64),
             CRC-32 (u32), packing (u8: 1 zlib of the bytes sorted by significance, 2 the same of differences), 3 zeros
     block   length as packed (u32), rows (u32), content
 
-The magic is chosen as PNG's is: whoever sends the file as text breaks it where it shows. A CRC-32 finds every damage of
-up to 32 bits in a row, and overlooks one of 4e9 others.
+The magic follows PNG's: a transfer as text changes it visibly. A CRC-32 detects every burst error of up to 32 bits, and
+misses one in 4e9 other errors.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 AnyArray = npt.NDArray[Any]
 Content = AnyArray | Sequence[AnyArray]
-"""An array, or pieces of it that follow one another."""
+"""An array, or consecutive pieces of it."""
 
 MAGIC: Final = b"\x8bLUMI\r\n\x1a"
 VERSION: Final = 1
@@ -33,23 +33,23 @@ HEAD: Final = struct.Struct("<8sHHIQ")
 ROW: Final = struct.Struct("<16s4sIQQIB3x")
 BLOCK: Final = struct.Struct("<II")
 BLOCK_BYTES: Final = 1 << 18
-"""A block of about this much is packed in less than a millisecond without letting others run."""
+"""Size of a block in bytes: packing it holds the interpreter lock for less than a millisecond."""
 DTYPES: Final = ("|u1", "<i4", "<i8", "<f4", "<f8")
 MOST_BYTES: Final = 1 << 31
-"""No map is larger; a table that says otherwise is damaged."""
+"""Largest size of a map in bytes; a table with a larger size is damaged."""
 SMALL_BYTES: Final = 64 << 20
 MOST_RATIO: Final = 32
-"""Of more than `SMALL_BYTES`, no map is so much smaller when packed (measured: 2 times); zlib can do 1000."""
+"""Largest compression ratio of more than `SMALL_BYTES` (measured: 2); zlib can reach 1000."""
 SORTED, DIFFERENCES = 1, 2
 LEVEL: Final = 1
-"""Of zlib: higher ones take five times as long for a twentieth less."""
+"""zlib level: higher ones take five times as long for a twentieth less."""
 
 
 class BadMap(Exception):
-    """A map that cannot be used. The text says what is wrong with it, without the file's name.
+    """A map that cannot be used. The text states the defect, without the file's name.
 
     Attributes:
-        remedy: what a person can do, or what the daemon does. advice: the same for who has named the file himself.
+        remedy: what an operator can do, or what the daemon does. advice: the same for an operator who named the file.
     """
 
     remedy = "it is kept, and done without"
@@ -57,26 +57,26 @@ class BadMap(Exception):
 
 
 class Foreign(BadMap):
-    """It is no map file at all."""
+    """The file is no map file at all."""
 
 
 class Newer(BadMap):
-    """A newer version of this software has written it."""
+    """A newer version of this software has written the file."""
 
     remedy = "install that version again, or move the file away"
     advice = "read it with that version"
 
 
 class Damaged(BadMap):
-    """It is not as it was written."""
+    """The file's content is damaged."""
 
 
 def nothing() -> None:
-    """Between two pieces of work: nobody has to be let in."""
+    """Default of ``breathe``: no pause between slices of work."""
 
 
 def pack(arrays: Mapping[str, Content], breathe: Callable[[], None] = nothing) -> bytes:
-    """A file with these arrays; ``breathe`` is called between pieces of work so that others may run."""
+    """Encode arrays as a file; ``breathe`` is called between slices of work so that other threads can run."""
     rows, contents = [], []
     for name, content in arrays.items():
         pieces = [content] if isinstance(content, np.ndarray) else list(content)
@@ -100,10 +100,10 @@ def _checksum(version: int, table: bytes) -> int:
 
 
 def unpack(data: bytes, known: Container[str] | None = None) -> dict[str, AnyArray]:
-    """The arrays of a file, each of its own memory; ``known``: names that there may be, None: any.
+    """Decode the arrays of a file, each in its own memory; ``known``: permitted names, None: any.
 
     Raises:
-        Foreign: not a map file. Newer: of a version to come. Damaged: anything else; names the place.
+        Foreign: not a map file. Newer: of a later version. Damaged: anything else; names the position.
     """
     version, count, crc = _head(data)
     table = data[HEAD.size : HEAD.size + count * ROW.size]
@@ -124,7 +124,7 @@ def unpack(data: bytes, known: Container[str] | None = None) -> dict[str, AnyArr
 
 
 def _bounded(table: bytes, packed: int, known: Container[str] | None) -> None:
-    """Whether what the table promises may be unpacked at all, before any of it is."""
+    """Check the sizes in the table before anything is unpacked."""
     size = 0
     for name, dtype, columns, rows, *_ in ROW.iter_unpack(table):
         title, kind = name.rstrip(b"\0").decode("ascii", "replace"), dtype.decode("ascii", "replace").rstrip("\0")
@@ -154,7 +154,7 @@ def _head(data: bytes) -> tuple[int, int, int]:
 
 
 def _blocks(pieces: Sequence[AnyArray], packing: int) -> Iterator[tuple[bytes, int]]:
-    """The blocks of an array that comes in pieces, with the rows in each."""
+    """The blocks of an array that comes in pieces, with the number of rows in each."""
     held: list[AnyArray] = []
     size = 0
     for piece in pieces:
@@ -181,7 +181,7 @@ def _block(parts: Sequence[AnyArray], packing: int) -> tuple[bytes, int]:
 
 
 def _array(title: str, packed: memoryview, dtype: str, row: tuple[int, int, int]) -> AnyArray:
-    """One array out of its blocks; everything that a table could say wrongly is checked before it is believed."""
+    """Decode one array from its blocks; every value of the table is checked before it is used."""
     columns, rows, packing = row
     if dtype not in DTYPES or packing not in (SORTED, DIFFERENCES):
         raise Damaged(f"the part `{title}` is of an unknown kind ({dtype}, packing {packing})")

@@ -1,6 +1,6 @@
-"""Changes of a map file as a whole: a rigid motion of its frame, or a name. Written as the next generation.
+"""Map file editing: rigid motion of the frame, or a new name, written as the next generation.
 
-Nothing here loads the estimator's compiler.
+This module does not load the estimator's compiler.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Array = npt.NDArray[np.float64]
 
 LONGEST_NAME: Final = 64
 LEAST_APART_M: Final = 1.0
-"""Points nearer together than this say nothing of how the map is turned."""
+"""Smallest distance of two points in m that determines a rotation."""
 TOLERANCE_M, TOLERANCE = 0.1, 0.01
-"""A point may be off by so much, and the scale by so much: what people measure with a tape."""
+"""Tolerances of a point (m) and of the scale: the accuracy of measurements with a tape."""
 
 
 class Refused(Exception):
-    """It cannot be done; the text says why and what to do."""
+    """The change is not possible; the text states the reason and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Fit:
 
 
 def opened(path: Path) -> Stored:
-    """What a map file holds.
+    """Read and check a map file.
 
     Raises:
         OSError: it cannot be read. BadMap: it cannot be used. Both name the file and the remedy.
@@ -65,7 +65,7 @@ def opened(path: Path) -> Stored:
 
 
 def put(path: Path, content: bytes) -> Path:
-    """Write a map to a place that a person has named; `OSError` names it and the remedy."""
+    """Write a map to a path that the operator chose; `OSError` contains the path and the remedy."""
     try:
         write_whole(path, content)
     except OSError as error:
@@ -74,7 +74,7 @@ def put(path: Path, content: bytes) -> Path:
 
 
 def keep(settings: Config, content: bytes, map_id: int) -> Path:
-    """Put a map into the configured folder; `OSError`, with the remedy, where another process uses it."""
+    """Store a map in the configured folder; `OSError`, with the remedy, where another process uses it."""
     if not settings.map.kept:
         raise OSError("`map.folder` is none; name a place with --out FILE")
     store = Store(maps_folder(settings.map.folder))
@@ -87,10 +87,10 @@ def keep(settings: Config, content: bytes, map_id: int) -> Path:
 
 
 def called(text: str) -> str:
-    """The name of a map.
+    """Check the text as a map name and return it.
 
     Raises:
-        Refused: it cannot be one.
+        Refused: it is not permitted.
     """
     text = text.strip()
     if len(text) > LONGEST_NAME or not text.isprintable():
@@ -99,9 +99,9 @@ def called(text: str) -> str:
 
 
 def written(path: Path, out: Path | None, tables: Tables, meta: Meta) -> Path:
-    """Write the map of ``path``, changed: to ``out``, else as the next generation beside it; returns where it is."""
+    """Write a changed map of ``path`` to ``out``, else as the next generation beside it; return its path."""
     content = pack({**tables, "meta": msgspec.structs.replace(meta, saved=time.time()).packed()})
-    read(content)  # what cannot be read again is not written
+    read(content)  # a map that cannot be read again is not written
     if out is not None:
         return put(out, content)
     store = Store(path.parent)
@@ -114,10 +114,10 @@ def written(path: Path, out: Path | None, tables: Tables, meta: Meta) -> Path:
 
 
 def pair_of(text: str) -> tuple[float, float, float, float]:
-    """``X,Y=X',Y'`` as four numbers, m.
+    """Parse ``X,Y=X',Y'`` into four numbers, m.
 
     Raises:
-        Refused: it is not written so.
+        Refused: wrong syntax.
     """
     sides = [side.split(",") for side in text.split("=")]
     try:
@@ -131,7 +131,7 @@ def pair_of(text: str) -> tuple[float, float, float, float]:
 
 
 def fitted(pairs: list[tuple[float, float, float, float]]) -> Fit:
-    """The rigid motion that brings the first points nearest to the second ones (least squares, Arun et al. 1987).
+    """Least-squares rigid motion that maps the first points to the second ones (Arun et al. 1987).
 
     Raises:
         Refused: fewer than two points, or all in one place.
@@ -153,7 +153,7 @@ def fitted(pairs: list[tuple[float, float, float, float]]) -> Fit:
 
 
 def judge(fit: Fit) -> None:
-    """Whether the points are those of one rigid body.
+    """Check that the point pairs belong to one rigid body.
 
     Raises:
         Refused: their distances disagree.
@@ -167,7 +167,7 @@ def judge(fit: Fit) -> None:
 
 
 def moved(tables: Tables, T: tuple[float, float, float]) -> Tables:
-    """The map with everything that lies in its frame moved."""
+    """The map with all poses in its frame transformed by T."""
     after = dict(tables)
     for key in ("submap.map", "pose"):
         after[key] = shifted(tables[key], T)
@@ -180,7 +180,7 @@ def moved(tables: Tables, T: tuple[float, float, float]) -> Tables:
 
 
 def shifted(poses: Array, T: tuple[float, float, float]) -> Array:
-    """Poses (n, 3) seen from the new frame."""
+    """Poses (n, 3) in the new frame."""
     x, y, yaw = T
     c, s = math.cos(yaw), math.sin(yaw)
     u, v, w = np.asarray(poses).T
@@ -189,7 +189,7 @@ def shifted(poses: Array, T: tuple[float, float, float]) -> Array:
 
 
 def turned(P: Array, yaw: float) -> Array:
-    """Covariances, (n, 9) row by row, in the axes of the new frame."""
+    """Covariances, (n, 9) in row-major order, rotated to the axes of the new frame."""
     c, s = math.cos(yaw), math.sin(yaw)
     R = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
     return np.asarray(R @ P.reshape(-1, 3, 3) @ R.T).reshape(-1, 9)

@@ -1,4 +1,4 @@
-"""Files of a folder of maps: generations by name, and whether what was written can be read back."""
+"""Map file generations of a folder: names and numbers, and verification of a written file."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ BROKEN_NAME: Final = re.compile(r"map-([0-9a-f]{8})-([0-9]{8})\.lumimap\.broken"
 
 @dataclass(frozen=True, slots=True)
 class Generation:
-    """One file.
+    """One map file of a folder.
 
     Attributes:
-        number: counts all saves in the folder; 0: somebody has put it there. map_id: by its name; negative: not told.
+        number: counts all saves in the folder; 0: an operator placed the file there. map_id: from its name; negative:
+            not contained in it.
     """
 
     number: int
@@ -30,13 +31,15 @@ class Generation:
 
 
 def verify(path: Path, content: bytes) -> None:
-    """Whether a file on the disk is what was written, and loads.
+    """Check that a file on the disk equals what was written, and loads.
 
     Raises:
-        Damaged: it is not. OSError: it cannot be read.
+        Damaged: it does not. OSError: it cannot be read.
     """
     with path.open("rb") as file:
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # from the disk, not from what we just gave it
+        os.posix_fadvise(
+            file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED
+        )  # read from the disk, not from the cache of what was just written
         found = file.read()
     if found != content:
         raise Damaged("what was read back is not what was written: the disk is failing")
@@ -44,7 +47,7 @@ def verify(path: Path, content: bytes) -> None:
 
 
 def said(error: OSError) -> str:
-    """What is wrong, for people."""
+    """Readable reason of an `OSError`."""
     if isinstance(error, BlockingIOError):
         return "another process keeps its maps there"
     return error.strerror or str(error)

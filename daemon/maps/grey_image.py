@@ -1,4 +1,4 @@
-"""Pictures that maps come as, PGM (Netpbm) and PNG (ISO/IEC 15948), read to shades of grey."""
+"""Greyscale image reader for imported maps: PGM (Netpbm) and PNG (ISO/IEC 15948)."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ Shades = npt.NDArray[np.float64]
 
 _PGM: Final = re.compile(rb"P([25])((?:\s+|#[^\n]*\n)+)(\d+)((?:\s+|#[^\n]*\n)+)(\d+)((?:\s+|#[^\n]*\n)+)(\d+)")
 _CHANNELS: Final = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-"""Of PNG's colour types."""
+"""Channels by PNG colour type."""
 _DEPTHS: Final = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
 _PALETTE: Final = 3
 
 
 class BadPicture(Exception):
-    """A picture that cannot be used; the text says why and what to do."""
+    """An image that cannot be used; the text states the reason and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """Shades (rows, columns), top row first, 0 black to 1 white: the mean of the colours.
+    """Greyscale image (rows, columns), top row first, 0 black to 1 white: the mean of the colours.
 
     Attributes:
-        grey: shades. alpha: 1 opaque, None where the picture has no transparency. colours: 1 or 3.
+        grey: pixel values. alpha: 1 opaque, None where the image has no transparency. colours: 1 or 3.
     """
 
     grey: Shades
@@ -40,7 +40,7 @@ class Picture:
 
 
 def read_picture(data: bytes, most: int) -> Picture:
-    """A PGM or PNG of at most so many pixels.
+    """Decode a PGM or PNG of at most ``most`` pixels.
 
     Raises:
         BadPicture: it is neither, or damaged, or too large.
@@ -125,7 +125,7 @@ def _shaded(values: npt.NDArray[np.int64], depth: int, colour: int, chunks: dict
 
 
 def _chunks(data: bytes) -> dict[str, bytes]:
-    """Contents by type, those of one type joined."""
+    """Chunk contents by type, those of one type concatenated."""
     found: dict[str, bytes] = {}
     at = len(SIGNATURE)
     while at + 12 <= len(data):
@@ -143,7 +143,7 @@ def _chunks(data: bytes) -> dict[str, bytes]:
 
 
 def _unfiltered(lines: npt.NDArray[np.uint8], step: int) -> npt.NDArray[np.uint8]:
-    """Undo the filter that each line names; ``step``: bytes of a pixel."""
+    """Undo the filter of each line; ``step``: bytes of a pixel."""
     out = np.zeros((len(lines) + 1, lines.shape[1] - 1), np.uint8)
     for row, line in enumerate(lines, 1):
         kind, raw, above = int(line[0]), line[1:], out[row - 1]
@@ -162,7 +162,7 @@ def _unfiltered(lines: npt.NDArray[np.uint8], step: int) -> npt.NDArray[np.uint8
 
 
 def _along(raw: list[int], above: list[int], step: int, kind: int) -> list[int]:
-    """A line whose pixels depend on the ones before: average, or Paeth's."""
+    """Undo a filter that depends on the preceding pixels of the line: Average or Paeth."""
     line: list[int] = []
     for at, value in enumerate(raw):
         a = line[at - step] if at >= step else 0
@@ -177,7 +177,7 @@ def _along(raw: list[int], above: list[int], step: int, kind: int) -> list[int]:
 
 
 def _values(lines: npt.NDArray[np.uint8], depth: int, count: int) -> npt.NDArray[np.int64]:
-    """Samples of each line as numbers."""
+    """Samples of each line as integers."""
     if depth == 16:
         return lines.view(">u2").astype(np.int64)
     if depth == 8:

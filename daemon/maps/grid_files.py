@@ -1,4 +1,4 @@
-"""An occupancy grid as files: PGM and YAML (map_server), and a picture with the path and the lamps."""
+"""Occupancy grid export: PGM and YAML (map_server), and a PNG with trajectory and lamps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WALL_GREY: Final = 0
 
 
 def finest(draw: Callable[[float], Grid]) -> Grid:
-    """The map at the finest of :data:`RESOLUTIONS_M` that its extent allows: ``draw`` raises `ValueError` beyond."""
+    """Grid at the finest of :data:`RESOLUTIONS_M` that its extent permits; ``draw`` raises `ValueError` otherwise."""
     for resolution in RESOLUTIONS_M[:-1]:
         try:
             return draw(resolution)
@@ -49,7 +49,7 @@ def pgm(grid: Grid) -> bytes:
 
 
 def map_yaml(grid: Grid, image: str) -> bytes:
-    """map_server's description: image by relative path, origin the lower left corner of the lower left pixel."""
+    """map_server YAML description: image by relative path, origin the lower left corner of the lower left pixel."""
     x, y = (float(value) + 0.0 for value in grid.origin)
     lines = (
         f"image: {image}",

@@ -1,4 +1,4 @@
-"""A map as the estimator has it, into the arrays of a map file and back. Pure."""
+"""Conversion between the estimator's map image and the arrays of a map file. Pure."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from daemon.maps.schema import Meta, Stored, Tables, lamp_tables, lamps_of
 from estimator import Array, Constraints, Identity, Keyframe, MapImage, Piece, Settled, Submap, Virtual, finished, se2
 
 SLICE: Final = 16
-"""Keyframes or submaps handled before others are let in."""
+"""Number of keyframes or submaps between two pauses for other threads."""
 
 Ranges = npt.NDArray[np.float32]
 
 
 def packed(image: MapImage, meta: Meta, breathe: Callable[[], None] = nothing) -> bytes:
-    """A map file. ``breathe`` is called every fraction of a millisecond, so that others may run."""
+    """Encode a map file. ``breathe`` is called every fraction of a millisecond, so that other threads can run."""
     return pack(tables_of(finished(image), meta, breathe), breathe)
 
 
 def meta_of(image: MapImage, saved: float, robot: str, software: str) -> Meta:
-    """What is said of the map as a whole."""
+    """Metadata of a map image."""
     who = image.identity
     return Meta(who.map_id, who.name, who.surveyed, who.survey, who.session, saved, robot, software)
 
 
 @dataclass(slots=True)
 class _Scans:
-    """Keyframes as rows; a scan that a submap's witness shares with a keyframe is kept once."""
+    """Keyframes as table rows; a scan shared by a submap's reference scan and a keyframe is stored once."""
 
     rows: list[tuple[Keyframe, int, Array]] = field(default_factory=list)
     row_of: dict[int, int] = field(default_factory=dict)
@@ -49,7 +49,7 @@ class _Scans:
         return self.row_of[frame.key]
 
     def fan(self, bearing: Array) -> int:
-        """Number of the bearings; lidars see along the same ones in every scan."""
+        """Index of an array of bearings; a lidar has the same ones in every scan, so they are stored once."""
         if id(bearing) not in self.fan_of:
             same = (k for k, fan in enumerate(self.fans) if np.array_equal(fan, bearing))
             known = next(same, len(self.fans))
@@ -60,7 +60,7 @@ class _Scans:
 
 
 def tables_of(image: MapImage, meta: Meta, breathe: Callable[[], None] = nothing) -> dict[str, Content]:
-    """The arrays of an image whose submaps are all settled."""
+    """Arrays of an image whose submaps are all finished."""
     scans = _Scans()
     for n, hung in enumerate(image.keyframes()):
         scans.add(*hung)
@@ -126,7 +126,7 @@ def _frames(scans: _Scans) -> dict[str, Content]:
 
 
 def _ranges(scans: _Scans, breathe: Callable[[], None]) -> dict[str, Content]:
-    """Ranges in whole millimetres where they are such, which is how lidars tell them: that packs far smaller."""
+    """Ranges as integers in mm where these are exact, as lidars report them: that packs far smaller."""
     mm: list[AnyArray] = [np.empty(0, "<i4")]
     m: list[AnyArray] = [np.empty(0, "<f4")]
     exact = []
@@ -144,7 +144,7 @@ def _ranges(scans: _Scans, breathe: Callable[[], None]) -> dict[str, Content]:
 
 
 def in_mm(range_m: Ranges) -> npt.NDArray[np.int32] | None:
-    """Ranges as whole millimetres, None where one of them is none to the last bit."""
+    """Ranges as integers in mm, None where one of them is not exactly such a value."""
     if not (np.abs(range_m) < 1e6).all():
         return None
     whole = np.rint(range_m.astype(np.float64) * 1e3).astype(np.int32)
@@ -152,7 +152,7 @@ def in_mm(range_m: Ranges) -> npt.NDArray[np.int32] | None:
 
 
 def in_m(whole: npt.NDArray[np.int32]) -> Ranges:
-    """The converse of :func:`in_mm`."""
+    """The inverse of :func:`in_mm`."""
     return (whole * 1e-3).astype(np.float32)
 
 
@@ -161,12 +161,12 @@ def _rows(rows: list[Array], columns: int) -> Array:
 
 
 def _lights(told: list[tuple[Array, Array] | None]) -> Array:
-    """Place and covariance of what light has told, those that were told anything only."""
+    """Pose and covariance of each light solution, only of those that exist."""
     return _rows([np.concatenate((T, P.reshape(-1))) for T, P in (one for one in told if one is not None)], 12)
 
 
 def image_from(stored: Stored, without: frozenset[int] = frozenset()) -> MapImage:
-    """The map in a file. ``without``: lamps whose gains are not believed any more."""
+    """Decode the map image of a stored map. ``without``: lamps whose stored gains are not valid any more."""
     meta, t = stored.meta, stored.tables
     frames = _kept_frames(t)
     pieces, stands = _kept_submaps(t, frames)
@@ -195,7 +195,7 @@ def image_from(stored: Stored, without: frozenset[int] = frozenset()) -> MapImag
 
 
 def _kept_submaps(t: Tables, frames: list[Keyframe]) -> tuple[tuple[Piece, ...], dict[int, Submap]]:
-    """Submaps as they stand in the image, and as something that keyframes can hang on."""
+    """Submaps as map image entries, and by key as nodes to which keyframes are attached."""
     ends = np.cumsum(t["submap.elements"])
     lights = _told(t["submap.lit"], t["submap.light"])
     pieces, stands = [], {}
@@ -213,7 +213,7 @@ def _kept_submaps(t: Tables, frames: list[Keyframe]) -> tuple[tuple[Piece, ...],
 
 
 def _kept_frames(t: Tables) -> list[Keyframe]:
-    """Keyframes that hang on nothing yet."""
+    """Keyframes that are not attached to a submap yet."""
     fans = np.split(t["fan.bearing"], np.cumsum(t["fan.beams"])[:-1]) if len(t["fan.beams"]) else []
     scans = _kept_scans(t)
     told = _told(t["frame.lit"], t["frame.light"])
@@ -229,7 +229,7 @@ def _kept_frames(t: Tables) -> list[Keyframe]:
 
 
 def _kept_scans(t: Tables) -> Iterator[tuple[Ranges, npt.NDArray[np.uint8]]]:
-    """Ranges and kinds of beam of each scan, in memory of its own, which is let go with it."""
+    """Ranges and beam kinds of each scan, in memory of its own, which is released with it."""
     at = at_mm = at_m = 0
     for fan, exact in zip(t["frame.fan"].tolist(), t["frame.exact"].tolist(), strict=True):
         n = int(t["fan.beams"][fan])
@@ -244,7 +244,7 @@ def _kept_scans(t: Tables) -> Iterator[tuple[Ranges, npt.NDArray[np.uint8]]]:
 
 
 def _told(lit: AnyArray, light: AnyArray) -> list[tuple[Array, Array] | None]:
-    """What light has told of each, None where it told nothing."""
+    """Light solution of each row, None where there is none."""
     told: list[tuple[Array, Array] | None] = [None] * len(lit)
     for row, at in enumerate(np.flatnonzero(lit).tolist()):
         told[at] = light[row, :3].copy(), light[row, 3:].reshape(3, 3).copy()

@@ -1,4 +1,4 @@
-"""Where keyframes, lamps and cells of a map image lie in the map frame."""
+"""Poses of keyframes, positions of lamps and the occupancy grid of a map image, in the map frame."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from estimator import Array, Grid, Keyframe, MapImage, Submap, at_once, finished
 
 
 def placed(image: MapImage) -> list[tuple[Keyframe, Array]]:
-    """Keyframes with T_map_keyframe, by number."""
+    """Keyframes with T_map_keyframe, in order of their numbers."""
     places = {piece.key: piece.T_map_submap for piece in image.submaps}
     found = [(hung.frame, se2.compose(places[hung.submap], hung.T_submap_keyframe)) for hung in image.keyframes()]
     return sorted(found, key=lambda one: one[0].key)
 
 
 def pieces_of(image: MapImage) -> Iterator[tuple[Submap, list[Keyframe]]]:
-    """Submaps, oldest first, with what hangs on each."""
+    """Submaps, oldest first, each with its keyframes."""
     hung: dict[int, list[Keyframe]] = {}
     for one in image.keyframes():
         hung.setdefault(one.submap, []).append(one.frame)
@@ -29,12 +29,12 @@ def pieces_of(image: MapImage) -> Iterator[tuple[Submap, list[Keyframe]]]:
 
 
 def grid_of(image: MapImage) -> Grid:
-    """The map at the finest resolution that its extent allows."""
+    """Occupancy grid of the map at the finest resolution that its extent permits."""
     return finest(partial(at_once, list(pieces_of(finished(image)))))
 
 
 def lamps_of(image: MapImage) -> Array | None:
-    """(k, 2) places of the lamps; None where the map does not lie in their frame."""
+    """(k, 2) positions of the lamps in m; None where the map is not in the survey frame."""
     if not image.identity.surveyed or not image.lamps:
         return None
     return np.array([(lamp.x, lamp.y) for lamp in image.lamps])

@@ -1,4 +1,4 @@
-"""The estimator's state at a start: empty or with a stored map, and with the residual map where there is one."""
+"""Initial estimator state: empty or from a stored map, with the residual map where there is one."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from daemon.maps.container import Damaged
 from daemon.maps.schema import read
 from daemon.maps.store import Start, Store, judge_for
 
-if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+if TYPE_CHECKING:  # the warm-up loads the estimator in a thread
     from estimator import LightsSetup, ResidualMap, Settings, State
 
 log = logging.getLogger(__name__)
 
 
 class CannotBegin(Damaged):
-    """A map that passes every check of its file, and yet the estimator cannot be begun with it."""
+    """A map that passes every check of its file, but with which the estimator cannot start."""
 
     remedy = "it is kept, the generation before it is used; please report it, with the file"
 
 
 def new_state(lights: Lights | None, settings: Settings | None = None, start: Start | None = None) -> State:
-    """The estimator's state for a robot just switched on, and the map it begins with; loads the estimator.
+    """Estimator state after power-on, with the map with which it starts; loads the estimator.
 
-    A residual map that cannot be used is named in the log, and the robot drives without.
+    A residual map that cannot be used is logged by name, and the robot drives without it.
 
     Raises:
         CannotBegin: the map is at fault. ValueError: the survey or the stored sample clock is.
@@ -46,15 +46,15 @@ def new_state(lights: Lights | None, settings: Settings | None = None, start: St
     settings = replace(settings or estimator.Settings(), localise=start.localise)
     try:
         return restored(image_from(start.stored, start.changed), settings, setup)
-    except Exception as error:  # what no check has foreseen must not end this start, and the next, and the next
-        estimator.new_state(settings, setup)  # what is wrong without a map too is not the map's fault
+    except Exception as error:  # a failure that no check covers must not end this start and every later one
+        estimator.new_state(settings, setup)  # an error that occurs without the map too is not the map's
         if isinstance(error, MemoryError):
             raise
         raise CannotBegin(f"it passes every check, but cannot be made into a state: {error!r}") from error
 
 
 def begun(lights: Lights | None, settings: Settings, start: Start | None) -> State:
-    """The same for a replay: the run that began without a map that it could not be begun with is repeated so."""
+    """The same for a replay: a run that started without its defective map is repeated in that way."""
     try:
         return new_state(lights, settings, start)
     except CannotBegin as error:
@@ -63,14 +63,14 @@ def begun(lights: Lights | None, settings: Settings, start: Start | None) -> Sta
 
 
 def setup_of(lights: Lights) -> LightsSetup:
-    """The photodiode as the estimator takes it; a residual map that cannot be used is named in the log."""
+    """Light setup as an estimator type; a residual map that cannot be used is logged by name."""
     from estimator import LightsSetup
 
     return LightsSetup(lights.survey, lights.profile, lights.clock_ppm, _learned(lights))
 
 
 def _learned(lights: Lights) -> ResidualMap | None:
-    """The residual map, None where there is none or it is of no use."""
+    """The residual map, None where there is none or it cannot be used."""
     if not lights.residuals:
         return None
     from daemon.config.residual_file import ResidualError, unpack
@@ -85,14 +85,14 @@ def _learned(lights: Lights) -> ResidualMap | None:
 
 
 class NoMap(Exception):
-    """There is no map, and nothing can be done without one; names the folder and the remedy."""
+    """No usable map exists, but the configuration requires one; the text contains the folder and the remedy."""
 
 
 def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tuple[Store | None, Start | None]:
-    """The folder of maps and the map that a run begins with, as far as there are such.
+    """Map folder and initial map of a run, each None where there is none.
 
     Raises:
-        NoMap: a map is to be used as it is, and there is none that can be.
+        NoMap: the configuration requires a stored map, and none can be used.
     """
     if not config.kept:
         return None, None
@@ -117,10 +117,10 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
 
 
 def recorded_start(path: Path, sha256: str, lights: Lights | None, localise: bool = False) -> Start:
-    """The map in a recording's folder.
+    """The initial map of a recorded run, from the recording's folder.
 
     Raises:
-        OSError: it cannot be read. BadMap: it is not the one that the run began with, or not good.
+        OSError: it cannot be read. BadMap: it is not the one with which the run started, or is damaged.
     """
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != sha256:

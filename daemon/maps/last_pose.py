@@ -1,10 +1,10 @@
-"""The pose as it was last, kept beside the maps, for the start after a kill or a power cut.
+"""Last pose file, stored beside the maps, for the start after a kill or a power cut.
 
-The map is saved every few minutes, the pose as the robot drives: up to five times a second, never while it stands.
-The file has two slots that are written in turn, each with a check sum and a number, so that a kill in mid-write leaves
-the one before. A thread writes; a disk that hangs costs the memory of the pose and nothing else. The disk itself is
-made to keep it every ten seconds at most: memory cards wear, and a robot that lost its power has been switched on by
-a person anyway.
+The map is saved every few minutes, the pose up to five times a second while the robot moves, and never at rest.
+The file has two slots that are written alternately, each with a checksum and a number. A kill during a write leaves the
+other one. A thread writes; a disk that hangs costs the stored pose and nothing else.
+The file is synced to the disk at most every ten seconds. Memory cards wear, and after a power loss an operator is
+present anyway to switch the robot on.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 FILE: Final = "last-pose"
 MOVED_M: Final = 0.02
 MOVED_RAD: Final = 0.01
-"""Less is not worth writing."""
+"""Smallest change in rad that is written."""
 WRITE_S: Final = 0.2
 SYNC_S: Final = 10.0
 RETRY_S: Final = 5.0
@@ -46,11 +46,11 @@ _SLOT_BYTES: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Remembered:
-    """What was kept.
+    """Content of one slot.
 
     Attributes:
-        map_id: of the map that the pose is in. pose: (x, y, yaw), m and rad, None: it was not known.
-        t_utc: when, seconds since 1970. number: counts what was ever kept.
+        map_id: of the map that contains the pose. pose: (x, y, yaw), m and rad, None: not available.
+        t_utc: time of writing, seconds since 1970. number: counts all writes.
     """
 
     map_id: int
@@ -60,14 +60,14 @@ class Remembered:
 
 
 def packed(told: Remembered) -> bytes:
-    """A slot of the file."""
+    """Encode a slot of the file."""
     x, y, yaw = told.pose or (0.0, 0.0, 0.0)
     body = _SLOT.pack(_MAGIC, told.map_id, told.number, x, y, yaw, told.t_utc, told.pose is not None)
     return (body + _CRC.pack(zlib.crc32(body))).ljust(_SLOT_BYTES, b"\0")
 
 
 def unpacked(slot: bytes) -> Remembered | None:
-    """What a slot holds; None where it is damaged, or was cut short by a kill."""
+    """Decode a slot; None where it is damaged or incomplete after a kill."""
     body, check = slot[: _SLOT.size], slot[_SLOT.size : _SLOT.size + _CRC.size]
     if len(check) < _CRC.size or _CRC.unpack(check)[0] != zlib.crc32(body):
         return None
@@ -78,7 +78,7 @@ def unpacked(slot: bytes) -> Remembered | None:
 
 
 def read(path: Path) -> Remembered | None:
-    """The latest whole slot; None where there is none. What cannot be read is said and passed over."""
+    """The latest complete slot; None where there is none. An unreadable file is logged and ignored."""
     try:
         content = path.read_bytes()[: 2 * _SLOT_BYTES]
     except (FileNotFoundError, NotADirectoryError):
@@ -91,25 +91,25 @@ def read(path: Path) -> Remembered | None:
 
 
 def _may_write(folder: Path) -> bool:
-    """Whether files can be made in a folder, or where it is to be made."""
+    """Whether files can be created in a folder, or in the nearest one that exists."""
     there = next((one for one in (folder, *folder.parents) if one.exists()), folder)
     return os.access(there, os.W_OK)
 
 
 class LastPose:
-    """Keeps the pose of a running daemon; :meth:`take` is a sink of the cycle.
+    """Stores the pose of a running daemon; :meth:`on_snapshot` is a sink of the cycle.
 
     Attributes:
-        before: what the run before has kept; None: nothing. error: why nothing can be kept, empty while all is well.
-        busy_since: when the write began that has not ended yet (`time.monotonic`), None: there is none.
+        before: slot of the previous run; None: none. error: reason why the pose cannot be stored, empty on success.
+        busy_since: start of the write in progress (`time.monotonic`, s), None: none.
     """
 
     def __init__(self, folder: Path, otherwise: Path | None = None) -> None:
-        """Read what is there; nothing is written before :meth:`start`.
+        """Read the stored slot; nothing is written before :meth:`start`.
 
         Args:
             folder: of the maps.
-            otherwise: where it is kept if nothing may be written there.
+            otherwise: folder that is used if the first is not writable.
         """
         self.path = (folder if otherwise is None or _may_write(folder) else otherwise) / FILE
         self.before = read(self.path)
@@ -123,22 +123,23 @@ class LastPose:
         self._wake = threading.Event()
         self._stop = False
         self._file, self._synced = -1, time.monotonic()
-        self._unsynced: Remembered | None = None  # written, and not on the disk for sure
+        self._unsynced: Remembered | None = None  # written, but not synced
         self._thread: threading.Thread | None = None
 
     def of_map(self, map_id: int) -> Pose | None:
-        """The pose that the run before has left in this map, if it knew one."""
+        """The pose of the previous run in this map; None if it had none."""
         return self.before.pose if self.before is not None and self.before.map_id == map_id else None
 
     def start(self) -> None:
-        """Begin to write."""
+        """Start the writing thread."""
         self._thread = threading.Thread(target=self._work, name="lumiloop-pose", daemon=True)
         self._thread.start()
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Keep the pose of a snapshot if it is news; returns at once.
+        """Store the pose of a snapshot if it has changed; returns at once.
 
-        A pose that this run has lost is forgotten. One that it has not found yet is left: it may be killed again.
+        A pose that this run has lost is deleted. The previous run's pose stays until this run has found its own,
+        because it may be killed again.
         """
         if snapshot.state in SURE and snapshot.pose is not None:
             if snapshot.t_sent >= self._due and self._is_news(snapshot.map_id, snapshot.pose):
@@ -162,7 +163,7 @@ class LastPose:
         self._wake.set()
 
     def close(self) -> None:
-        """Write what is left, for a second at most; idempotent."""
+        """Write the latest pose, waiting at most one second; idempotent."""
         self._stop = True
         self._wake.set()
         if self._thread is not None:
@@ -179,9 +180,9 @@ class LastPose:
         self._close()
 
     def _turn(self) -> None:
-        """Write the newest pose, if there is one, and now and then see to it that the disk has it.
+        """Write the newest pose, if there is one, and sync the file from time to time.
 
-        After a failure the disk has to have it at once, else nobody knows whether it works again.
+        After a failure the file is synced at once, because otherwise a recovery of the disk stays undetected.
         """
         with self._lock:
             told, self._next = self._next, None
@@ -193,7 +194,7 @@ class LastPose:
             if self._unsynced is not None and (self._stop or self.error or overdue):
                 os.fdatasync(self._file)
                 self._unsynced, self._synced = None, time.monotonic()
-        except Exception as error:  # noqa: BLE001  no memory, or a defect, must not end the thread either; it is told
+        except Exception as error:  # noqa: BLE001  no memory, or a defect, must not end the thread either; the error is reported
             self._say(f"{self.path}: {reason_of(error)}", defect_in(error))
             with self._lock:
                 self._next = self._next or told or self._unsynced
@@ -212,7 +213,7 @@ class LastPose:
         self._unsynced = told
 
     def _close(self) -> None:
-        """Let go of the file; the next write opens it anew."""
+        """Close the file; the next write opens it again."""
         file, self._file, self._unsynced = self._file, -1, None
         if file >= 0:
             with contextlib.suppress(OSError):
@@ -220,7 +221,7 @@ class LastPose:
 
     def _say(self, error: str, defect: Exception | None = None) -> None:
         if error and not self.error:
-            level = logging.INFO if defect is None else logging.WARNING  # the fault warns
+            level = logging.INFO if defect is None else logging.WARNING  # the fault is the warning
             log.log(level, "the pose cannot be kept for the next start: %s; it is tried again", error, exc_info=defect)
         elif self.error and not error:
             log.info("the pose is kept for the next start again")

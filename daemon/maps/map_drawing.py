@@ -1,6 +1,6 @@
-"""A map with a trajectory as a picture to look at: walls dark on white, the path coloured from its start to its end.
+"""Map image rendering: grid dark on white, the trajectory coloured from start to end, lamps and a scale bar.
 
-Ceiling lamps, where the map lies in their survey, are rings filled with yellow.
+Ceiling lamps are drawn as rings filled with yellow, if the map is in the survey frame.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from estimator import Array, Grid
 Pixels = npt.NDArray[np.float64]
 
 SMALLEST_SIDE: Final = 1200
-"""Cells are drawn larger until the longer side has about this many pixels."""
+"""Cells are enlarged until the longer side has about this many pixels."""
 
 UNKNOWN: Final = np.array((205.0, 211.0, 220.0))
 FREE: Final = np.array((255.0, 255.0, 255.0))
@@ -31,8 +31,8 @@ _RING_PX: Final = 2.0
 _LINE_PX: Final = 1.2
 _JUMP_M: Final = 0.5
 _JUMP_TIMES: Final = 8.0
-"""Between two positions that lie farther apart than this, and than so many ordinary steps, nothing was driven: the
-robot was carried, or found elsewhere. No line is drawn."""
+"""No line is drawn between two positions farther apart than this, and than this many typical steps. The robot was
+carried there or found elsewhere."""
 _DOT_PX: Final = 7.0
 _BAR_PX: Final = 3.0
 _LETTERS: Final = {
@@ -47,7 +47,7 @@ _BAND: Final = 64
 """Rows of cells that are drawn at a time."""
 
 Discs = tuple[Array, Pixels, float]
-"""Places (n, 2) in pixels, colours (n, 3) and radius."""
+"""Positions (n, 2) in pixels, colours (n, 3) and radius."""
 
 
 def draw(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.uint8]:
@@ -65,7 +65,7 @@ def draw(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.
     scale = max(1, round(SMALLEST_SIDE / max(rows, columns)))
     discs = _discs(grid, path, lamps, scale)
     pixels = np.empty((scale * rows, scale * columns, 3), np.uint8)
-    for first in range(0, rows, _BAND):  # what is computed with takes twenty times the memory of the picture
+    for first in range(0, rows, _BAND):  # the intermediate arrays take twenty times the memory of the image
         band = _shade(probability[first : first + _BAND].repeat(scale, axis=0).repeat(scale, axis=1))
         top = scale * first
         for places, colours, radius in discs:
@@ -76,7 +76,7 @@ def draw(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.
 
 
 def _shade(probability: npt.NDArray[np.float32]) -> Pixels:
-    """Unknown at one half, towards free below and towards wall above."""
+    """Pixel shades of an occupancy probability: one half is unknown, lower is free, higher is occupied."""
     certain = 2.0 * probability[..., None].astype(np.float64) - 1.0
     goal = np.where(certain > 0.0, WALL, FREE)
     return np.asarray(UNKNOWN + np.abs(certain) * (goal - UNKNOWN))
@@ -89,7 +89,7 @@ def _to_pixels(grid: Grid, path: Array, scale: int, rows: int) -> Array:
 
 
 def _discs(grid: Grid, path: Array, lamps: Array | None, scale: int) -> list[Discs]:
-    """What is drawn over the map, the lowest first."""
+    """Discs drawn over the map, the lowest layer first."""
     rows = scale * len(grid.log_odds)
     discs: list[Discs] = []
     if lamps is not None and len(lamps) > 0:
@@ -101,7 +101,7 @@ def _discs(grid: Grid, path: Array, lamps: Array | None, scale: int) -> list[Dis
 
 
 def _line(places: Array, pixels_per_metre: float) -> list[Discs]:
-    """The path, densely stamped with soft dots, and a larger dot at either end; nothing where the robot was carried."""
+    """The path as dense soft dots with a larger dot at either end; nothing where the robot was carried."""
     steps = np.hypot(*np.diff(places, axis=0).T) if len(places) > 1 else np.zeros(0)
     driven = steps[steps > 0.01 * pixels_per_metre]
     ordinary = float(np.percentile(driven, 90.0)) if len(driven) else 0.0
@@ -120,7 +120,7 @@ def _line(places: Array, pixels_per_metre: float) -> list[Discs]:
 
 
 def _stamp(pixels: Pixels, places: Array, colours: Pixels, radius: float) -> None:
-    """Blend a soft-edged disc of ``radius`` pixels at each place; a pixel takes the colour of its last disc."""
+    """Blend a soft-edged disc of ``radius`` pixels at each position; a pixel takes the colour of its last disc."""
     reach = int(np.ceil(radius)) + 1
     rows, columns = pixels.shape[:2]
     near = (places[:, 0] > -reach - 1) & (places[:, 0] < rows + reach + 1)
@@ -142,14 +142,14 @@ def _stamp(pixels: Pixels, places: Array, colours: Pixels, radius: float) -> Non
 
 
 def lettered(text: str) -> npt.NDArray[np.bool_]:
-    """A length in pixels, (14, columns), true where there is ink; no font has to be installed for that."""
+    """Bitmap of a length label, (14, columns) pixels, true where there is ink; it needs no installed font."""
     letters = [np.array([[pixel == "#" for pixel in row] for row in _LETTERS[letter]]) for letter in text]
     word = np.concatenate([np.pad(letter, ((0, 0), (0, 1))) for letter in letters], axis=1)
     return word.repeat(_LETTER_PX, axis=0).repeat(_LETTER_PX, axis=1)
 
 
 def _draw_bar(pixels: npt.NDArray[np.uint8], pixels_per_metre: float) -> None:
-    """A scale bar in the lower left corner, the longest of 1, 5, 10, 50, 100 m that takes at most a third."""
+    """Draw a scale bar in the lower left corner, the longest of 1, 5, 10, 50, 100 m that takes at most a third."""
     rows, columns = pixels.shape[:2]
     length = next((m for m in (100, 50, 10, 5, 1) if m * pixels_per_metre <= columns / 3), 0)
     margin = round(4 * _BAR_PX)

@@ -1,6 +1,6 @@
 """Fallback from a stored map in its own frame to a new one where light fixes the pose; logs each change.
 
-See `estimator.relocalisation.unaligned_map`: it is put aside, and found on the way or let go of.
+The stored map becomes an unaligned map, which is found later or abandoned (`estimator.relocalisation.unaligned_map`).
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ LET_GO: Final = (
 
 
 def another(map_id: int, t_mono: float) -> int:
-    """Identity of the map that follows one that was let go of, or forgotten (RESET), at an instant; never 0.
+    """Identity of the map that follows an abandoned or deleted (RESET) one at an instant; never 0.
 
-    Not the next number: whoever switches back to the stored map, and leaves it so again, begins a third one, and what
-    is stored of the second stays.
+    It is not the next number. After a switch back to the stored map and a second fallback, a third map starts, and the
+    stored content of the second stays.
     """
     return zlib.crc32(struct.pack("<Id", map_id, t_mono)) or 1
 
 
 def let_go(before: StepResult | None, now: StepResult, map_id: int) -> bool:
-    """Say what has become of the map with this ID in a step; whether the estimator is in another one since."""
+    """Log what happened to the map with this ID in a step; return whether the estimator now uses another one."""
     was, gone = (False, 0) if before is None else (before.aside, before.let_go)
     if now.let_go > gone:
         log.warning(LET_GO, map_id)

@@ -1,7 +1,8 @@
-"""Maps of ROS map_server and nav2: a YAML file that describes a picture, read to what each cell is.
+"""Import of ROS map_server and nav2 maps: a YAML description and an image, converted to trinary cells.
 
 Semantics: nav2_map_server's and map_server's documentation (wiki.ros.org/map_server, "YAML format" and "Value
-interpretation"). Of YAML, what such files consist of is read: ``key: value`` lines, lists in one line or with dashes.
+interpretation"). The parser accepts the subset of YAML in such files: ``key: value`` lines, lists in one line or with
+dashes.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ MOST_CELLS: Final = 50_000_000
 
 
 class BadMapServer(Exception):
-    """A description or a picture that cannot be used; the text names the file, what is wrong, and the remedy."""
+    """A description or an image that cannot be used; the text names the file, the defect, and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What the YAML file says.
+    """Content of the YAML file.
 
     Attributes:
-        image: path of the picture. resolution: m per pixel. origin: (x, y, yaw) of the lower left corner. negate:
-            white is occupied. occupied, free: thresholds of the probability. mode: one of :data:`MODES`.
+        image: path of the image. resolution: m per pixel. origin: (x, y, yaw) of the lower left corner. negate: white
+            is occupied. occupied, free: thresholds of the probability. mode: one of :data:`MODES`.
     """
 
     image: Path
@@ -50,7 +51,7 @@ class Description:
 
 
 def load(path: Path) -> tuple[Description, Trinary]:
-    """The description and the cells of a map.
+    """Read the description and the cells of a map.
 
     Raises:
         BadMapServer: either cannot be used.
@@ -73,10 +74,10 @@ def load(path: Path) -> tuple[Description, Trinary]:
 
 
 def describe(path: Path, text: str) -> Description:
-    """What the YAML text says.
+    """Parse the YAML text.
 
     Raises:
-        BadMapServer: a field is missing or makes no sense.
+        BadMapServer: a field is missing or invalid.
     """
     fields = _fields(path, text)
     for key in ("image", "resolution", "origin"):
@@ -124,7 +125,7 @@ def _number(path: Path, key: str, text: str | list[str]) -> float:
 
 
 def _fields(path: Path, text: str) -> dict[str, str | list[str]]:
-    """Keys and values as text; a list as a list of text. Keys that nobody knows are passed over, as map_server does."""
+    """Keys and values as text; a list as a list of text. Unknown keys are ignored, as by map_server."""
     fields: dict[str, str | list[str]] = {}
     key = ""
     for number, raw in enumerate(text.lstrip("\ufeff").splitlines(), 1):
@@ -152,7 +153,7 @@ def _fields(path: Path, text: str) -> dict[str, str | list[str]]:
 
 
 def _uncommented(line: str) -> str:
-    """Without a comment: from the line's start, or a blank, and a ``#`` on, outside quotes."""
+    """The line without its comment: a ``#`` outside quotes, at the line's start or after a blank, and what follows."""
     quote = ""
     for at, character in enumerate(line):
         if quote:
@@ -165,7 +166,7 @@ def _uncommented(line: str) -> str:
 
 
 def cells_of(described: Description, picture: Picture) -> Trinary:
-    """What each cell is, by map_server's rules for the mode."""
+    """Cells by map_server's rules for the mode."""
     grey, alpha = picture.grey[::-1], None if picture.alpha is None else picture.alpha[::-1]
     if described.mode == "raw":
         value = np.rint(255.0 * grey)
@@ -173,7 +174,7 @@ def cells_of(described: Description, picture: Picture) -> Trinary:
         probability = value / 100.0
     else:
         shade = grey
-        if described.mode == "trinary" and alpha is not None:  # map_server takes transparency for one more colour
+        if described.mode == "trinary" and alpha is not None:  # map_server averages transparency as one more colour
             shade = (grey * picture.colours + alpha) / (picture.colours + 1)
         probability = shade if described.negate else 1.0 - shade
         known = np.ones(grey.shape, np.bool_)

@@ -1,4 +1,4 @@
-"""The smallest PNG writer that serves: 8-bit RGB, no interlace, one filter (ISO/IEC 15948)."""
+"""Minimal PNG encoder: 8-bit RGB, no interlace, one filter (ISO/IEC 15948)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:
     above = np.zeros_like(pixels)
     above[1:] = pixels[:-1]
     lines = np.empty((rows, 1 + 3 * columns), np.uint8)
-    lines[:, 0] = _UP  # each line says how it differs from the one above: maps are mostly flat
+    lines[:, 0] = _UP  # each line holds its difference from the one above: maps are mostly uniform
     lines[:, 1:] = (pixels - above).reshape(rows, -1)
     head = struct.pack(">IIBBBBB", columns, rows, 8, _RGB, 0, 0, 0)
     data = zlib.compress(lines.tobytes(), 6)

@@ -1,6 +1,6 @@
-"""What stands in a map file, as arrays: which there are, what must be true of them, what they say of the map.
+"""Map file schema: the arrays, their consistency checks, and information about a map derived from them.
 
-Nothing here needs the estimator, so that ``lumiloop map info`` loads no compiler.
+This module does not need the estimator, so that ``lumiloop map info`` loads no compiler.
 """
 
 from __future__ import annotations
@@ -62,18 +62,18 @@ KINDS: Final[dict[str, tuple[str, int]]] = {
     "pose": ("<f8", 3),
     "pose.P": ("<f8", 3),
 }
-"""Arrays of version 1: dtype and columns. docs/maps.md says what each is."""
+"""Arrays of version 1: dtype and columns. docs/maps.md describes each."""
 
 AWAY_M: Final = 0.3
-"""A lamp that hangs farther from where it did is another one, or was moved."""
+"""Distance in m by which a lamp may differ from its earlier position; a larger one means another or a moved lamp."""
 SAME_SHARE: Final = 0.5
-"""A survey that fewer lamps have in common with the map is another building's, or has another frame."""
+"""Smallest share of common lamps of two surveys; below it the map belongs to another building or frame."""
 LAST_SHARE: Final = 0.25
-"""The part of a torn map in which the robot was last is taken, unless it has less of the submaps than this."""
+"""Smallest share of the submaps with which the part of the robot's last position is chosen from a split map."""
 
 
 class OtherBuilding(BadMap):
-    """It was made with the survey of another building."""
+    """The map was made with the survey of another building."""
 
     remedy = (
         "name the survey that it was made with in `lights.survey`, or another `map.folder`; the command RESET begins "
@@ -82,11 +82,11 @@ class OtherBuilding(BadMap):
 
 
 class Meta(msgspec.Struct, frozen=True):
-    """What is said of the map as a whole.
+    """Metadata of a map.
 
     Attributes:
         map_id, name, surveyed, survey, session: see `estimator.mapping.map_snapshot.Identity`. saved: seconds of UTC.
-        robot: whose configuration it was. software: its version.
+        robot: name in the configuration. software: version that wrote the file.
     """
 
     map_id: int
@@ -99,16 +99,16 @@ class Meta(msgspec.Struct, frozen=True):
     software: str = ""
 
     def packed(self) -> AnyArray:
-        """As it stands in the file."""
+        """The metadata as an array of the file."""
         return np.frombuffer(msgspec.json.encode(self), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stored:
-    """What a map file holds, found to be whole and consistent.
+    """Content of a map file after all checks.
 
     Attributes:
-        isolated: submaps left out because nothing joins them with the rest.
+        isolated: submaps removed because no edge connects them with the rest.
     """
 
     meta: Meta
@@ -117,10 +117,10 @@ class Stored:
 
 
 def read(content: bytes) -> Stored:
-    """What a file holds; of a map in several parts, one (:func:`main_part`).
+    """Decode and check a map file; of a map in several parts, one is returned (:func:`main_part`).
 
     Raises:
-        BadMap: it cannot be used; the text says why.
+        BadMap: it cannot be used; the text states the reason.
     """
     tables = unpack(content, KINDS)
     meta = _meta(tables)
@@ -139,7 +139,7 @@ def _meta(tables: Tables) -> Meta:
 
 
 def check(tables: Tables) -> None:
-    """Whether the arrays are those of a map and agree with each other.
+    """Check that the arrays are those of a map and consistent with each other.
 
     Raises:
         Damaged: names the array.
@@ -203,9 +203,9 @@ def _adds_up(counts: AnyArray, total: int) -> bool:
 
 
 def parts(tables: Tables) -> Keys:
-    """Number of the part of the graph that each submap belongs to; parts are joined by nothing.
+    """Connected component of the pose graph for each submap, as a number.
 
-    Submaps whose place light has told lie in one frame, the survey's: that joins them, too.
+    Submaps with a light solution share one frame, the survey's, which connects them too.
     """
     keys = tables["submap.key"]
     lit = np.flatnonzero(tables["submap.lit"])
@@ -222,7 +222,7 @@ def parts(tables: Tables) -> Keys:
 
 
 def main_part(tables: Tables) -> npt.NDArray[np.bool_]:
-    """Which submaps make up the map: where the robot was last, or by far the most of them."""
+    """Mask of the submaps of the component with the robot's last position, or else of the largest one."""
     part = parts(tables)
     if len(part) == 0:
         return np.ones(0, np.bool_)
@@ -233,7 +233,7 @@ def main_part(tables: Tables) -> npt.NDArray[np.bool_]:
 
 
 def only(tables: Tables, keep: npt.NDArray[np.bool_]) -> Tables:
-    """The same with some of the submaps only, and what hangs on them; scans stay where they are."""
+    """The tables reduced to some of the submaps and their entries; scans keep their indices."""
     keys, t = tables["submap.key"], tables
     kept = dict(tables)
     lit = t["submap.lit"] != 0
@@ -250,13 +250,13 @@ def only(tables: Tables, keep: npt.NDArray[np.bool_]) -> Tables:
 
 
 def lamps_of(tables: Tables) -> tuple[Lamp, ...]:
-    """The lamps known when it was saved."""
+    """Surveyed lamps at the time of saving."""
     rows = zip(tables["lamp.id"].tolist(), tables["lamp"].tolist(), strict=True)
     return tuple(Lamp(lamp_id, code, *numbers) for (lamp_id, code), numbers in rows)
 
 
 def lamp_tables(lamps: tuple[Lamp, ...]) -> Tables:
-    """The converse of :func:`lamps_of`."""
+    """The inverse of :func:`lamps_of`."""
     rows = [
         (lamp.x, lamp.y, lamp.z, lamp.power_w, lamp.order, lamp.slope_x, lamp.slope_y, lamp.sigma_ln) for lamp in lamps
     ]
@@ -265,12 +265,12 @@ def lamp_tables(lamps: tuple[Lamp, ...]) -> Tables:
 
 
 def digest_of(survey: Survey) -> str:
-    """What tells one survey from another; empty for one without lamps."""
+    """Digest of a survey; empty for one without lamps."""
     return hashlib.sha256(msgspec.json.encode(survey)).hexdigest() if survey.lamps else ""
 
 
 def against_survey(stored: Stored, survey: Survey) -> tuple[str, frozenset[int]]:
-    """What has changed in the survey since the map was made: in words, and the lamps it concerns; "" and none if not.
+    """Changes of the survey since the map was made: as text, and the lamps concerned; both empty without changes.
 
     Raises:
         OtherBuilding: the two have next to nothing in common.
@@ -303,7 +303,7 @@ def _apart(a: Lamp, b: Lamp) -> float:
 
 
 def summary(stored: Stored) -> dict[str, Any]:
-    """What a person wants to know of a map."""
+    """Summary of a map for display."""
     meta, t = stored.meta, stored.tables
     at = t["submap.map"][:, :2]
     reach = [0.0, 0.0] if len(at) == 0 else np.ptp(at, axis=0).round(1).tolist()

@@ -1,13 +1,13 @@
 """Guard against a stored map with which every start fails: after three failures the generation before it is used.
 
-Such a file is good by all that can be told from it, and meets a defect of the software. A service that is started again
-and again with it would never come up; without it the robot works. What counts are starts since the computer was
-switched on, a battery that fails says nothing of a map, and those that have come as far as to begin: a cache or a
-folder for a recording that has no room says nothing either.
+Such a file passes every check, but triggers a defect of the software. A service that restarts with it again and again
+would never come up; without it the robot works.
+Only starts since the computer was switched on count, because a failing battery is not the map's fault. Only starts that
+reached the estimator count: a full disk for the kernel cache or a recording is not the map's fault either.
 
-What is left out stays where it is until a start without it has lasted, which is what speaks against it: only then it is
-moved aside (`daemon.maps.store`). Where three starts without any map do not last either, all are tried again, and so on
-in turn.
+An excluded file stays in place until a start without it has lasted, which is the evidence against it. Only then it is
+moved aside (`daemon.maps.store`). Where three starts without any map do not last either, all files are tried again, and
+so on in turn.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from typing import Final
 from daemon.system.atomic_file import write_whole
 
 NAME: Final = "starts"
-"""File in the folder of maps: what has been counted, as JSON."""
+"""Name of the JSON file with the counts, in the folder of maps."""
 MOST: Final = 3
 PROOF_S: Final = 10.0
-"""A start that has lasted so long since its map was loaded is none that the map has ended."""
+"""Time in s since loading the map after which the map cannot be the cause of a failure."""
 BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
 LEFT_OUT: Final = (
     f"{MOST} starts in a row have begun with it, and none has lasted for {PROOF_S:g} s; it is left out, and moved "
@@ -34,11 +34,11 @@ LEFT_OUT: Final = (
 
 @dataclass(frozen=True, slots=True)
 class StartAttempts:
-    """What the file holds.
+    """Content of the file.
 
     Attributes:
-        boot: the run of the computer. of: the file that starts have begun with, empty: with none. count: of starts in a
-            row that have not lasted. out: files that are left out.
+        boot: boot ID of the computer. of: name of the file with which the starts began, empty: none. count: consecutive
+            starts that have not lasted. out: names of excluded files.
     """
 
     boot: str = ""
@@ -51,7 +51,7 @@ class StartTrial:
     """Counts starts, in a file. Where it cannot be written, none counts.
 
     Attributes:
-        out: names of the files that are left out.
+        out: names of the excluded files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -60,7 +60,7 @@ class StartTrial:
         self.out: tuple[str, ...] = ()
 
     def read(self) -> None:
-        """Take up what earlier starts of this run of the computer have come to."""
+        """Read the counts of earlier starts since the computer was switched on."""
         boot = _boot()
         try:
             told = json.loads(self._path.read_text(encoding="ascii"))
@@ -71,9 +71,9 @@ class StartTrial:
         self.out = self._told.out
 
     def changes(self, name: str) -> bool:
-        """This start would begin with this file, empty: with none. Whether it shall choose anew, out of others.
+        """Register this start's file (empty: none); return whether it is excluded and another has to be chosen.
 
-        Where it may, what is chosen then has as many starts as this had.
+        The count of the next choice starts at zero.
         """
         told = self._told if self._told.of == name else replace(self._told, of=name, count=0)
         out = (*told.out, name) if name else ()
@@ -84,18 +84,18 @@ class StartTrial:
         return True
 
     def begin(self) -> None:
-        """The estimator is about to begin: what ends this start from now on may be the map."""
+        """Count this start: from now on, its failure may be caused by the map."""
         if self._told.of or self._told.out:
             self._begun = self._wrote(replace(self._told, count=self._told.count + 1))
 
     def ended(self) -> None:
-        """Somebody has ended this start before it had lasted, so it says nothing."""
+        """Undo the count of this start: it was stopped on request before it had lasted."""
         if self._begun:
             self._begun = False
             self._wrote(replace(self._told, count=self._told.count - 1))
 
     def lasted(self) -> tuple[str, ...]:
-        """This start has: no other one counts any more. Returns what it has done without."""
+        """Clear all counts, because this start has lasted; return the files excluded from it."""
         out, self.out, self._begun = self.out, (), False
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)
@@ -111,7 +111,7 @@ class StartTrial:
 
 
 def _boot() -> str:
-    """Which run of the computer this is; "-" where it does not say."""
+    """Boot ID of the computer; "-" where it is not available."""
     try:
         return BOOT.read_text(encoding="ascii").strip()
     except OSError:

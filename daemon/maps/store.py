@@ -1,13 +1,13 @@
-"""The folder in which maps are kept: generations of whole files, of which the newest good one is loaded.
+"""Map store: the folder of map files in generations, of which the newest good one is loaded.
 
-A map is written beside, synced, moved to a name of its own, read back and compared; only then do older generations go.
-A power cut, or a kill at any moment, therefore leaves the old map or the new one. A file that is not as it was written
-is moved aside under the same name with ``.broken`` and never deleted.
+A map is written under a temporary name, synced, renamed, read back and compared; only then are older generations
+deleted. A power cut, or a kill at any moment, therefore leaves the old map or the new one. A damaged file is renamed
+with the suffix ``.broken``; the newest few of these stay.
 
-Kept of the map in use are the two newest generations, of which one may fail, and the one that this run began with: it
-is the last that a whole run has proved, should this run spoil the map. Of every other map (RESET begins one, and each
-building has its own) the newest good generation is kept, of the seven latest: nothing goes but behind a file that has
-been read.
+Of the map in use, the store keeps the two newest generations, of which one may fail. It also keeps the one with which
+this run started. That one is the last that a whole run has confirmed, should this run spoil the map. Of every other map
+(RESET starts one, and each building has its own) the newest good generation is kept, of the seven latest maps. A file
+is deleted only after a newer one has been read.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ log = logging.getLogger(__name__)
 
 LOCK: Final = "lock"
 MOST_BROKEN: Final = 8
-"""Files that a failing disk has spoilt while they were saved, kept for who wants to know."""
+"""Number of files kept for diagnosis that a failing disk has damaged during a save."""
 START: Final = "start.lumimap"
-"""File of a recording's folder: the map that the run began with."""
+"""File name of the initial map in a recording's folder."""
 NEWEST: Final = 2
 OTHERS: Final = 7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """The map that a run begins with.
+    """The map with which a run starts.
 
     Attributes:
-        content: of the file. stored: what it holds. changed: lamps whose gains are not believed, because the survey has
-            changed since. localise: it is only used, and never changed.
+        content: of the file. stored: the decoded map. changed: lamps whose gains are not used, because the survey has
+            changed since. localise: the map is only used, and never changed.
     """
 
     content: bytes
@@ -57,16 +57,16 @@ class Start:
 
 
 Judge = Callable[[Stored], tuple[str, frozenset[int]]]
-"""Whether a map fits the configured survey: see `store_tables.against_survey`."""
+"""Check of a map against the configured survey: see `daemon.maps.schema.against_survey`."""
 
 
 def unjudged(stored: Stored) -> tuple[str, frozenset[int]]:
-    """Every map fits where there is no survey."""
+    """Check for a configuration without a survey: every map fits."""
     return "", frozenset()
 
 
 def judge_for(lights: Lights | None) -> Judge:
-    """Whether a map fits what is configured of lights."""
+    """Check of maps against the configured light setup."""
     return unjudged if lights is None else partial(against_survey, survey=lights.survey)
 
 
@@ -74,13 +74,14 @@ class Store:
     """A folder of maps, used by one process at a time.
 
     Attributes:
-        damaged: whether a map was found and could not be used. left_out: or is not, because no start has outlived it.
-        trouble: what kept `claim` from taking the folder.
-        trial: of the map that a run begins with which has taken the folder.
+        damaged: a map was found and could not be used. left_out: a map is excluded, because no start with it has
+            lasted.
+        trouble: reason why `claim` could not lock the folder.
+        trial: start trial of the initial map, for a run that has locked the folder.
     """
 
     def __init__(self, folder: Path, mend: bool = True) -> None:
-        """Nothing is touched yet. ``mend``: what is broken may be moved aside."""
+        """Nothing is touched yet. ``mend``: damaged files may be moved aside."""
         self.folder = folder
         self._mend = mend
         self.damaged = self.left_out = False
@@ -96,9 +97,9 @@ class Store:
         return self.damaged or self.left_out
 
     def claim(self) -> None:
-        """Take the folder for this process before there is a map to save: what keeps it from that is known at once.
+        """Lock the folder for this process before there is a map to save, so that an obstacle is reported at once.
 
-        May be tried again; what has not changed is not said again.
+        It may be called again; an unchanged obstacle is not reported again.
         """
         try:
             self._use()
@@ -108,11 +109,11 @@ class Store:
                 log.error("no map can be kept in %s; mend that, or name another `map.folder`", self.trouble)
 
     def generations(self) -> list[Generation]:
-        """All that are there, newest first."""
+        """All map files, newest first."""
         try:
             paths = sorted(self.folder.glob("*.lumimap")) if self.folder.is_dir() else []
             if not paths and self.folder.exists():
-                os.scandir(self.folder).close()  # says why there is nothing to be seen
+                os.scandir(self.folder).close()  # raises the reason why nothing can be listed
         except FileNotFoundError:
             return []
         found = []
@@ -122,11 +123,12 @@ class Store:
         return sorted(found, key=lambda one: one.number, reverse=True)
 
     def load(self, judge: Judge = unjudged) -> Start | None:
-        """The newest good map that fits; None where there is none. What cannot be used is said in the log.
+        """The newest good map that fits; None where there is none. An unusable file is logged.
 
-        Where a generation is damaged the one before it counts. Another map than the latest is taken only if that one
-        belongs to another building: what a person has begun anew does not come back by itself. A file under a name
-        of one's own is no generation of anything: where it is damaged the next one counts.
+        Where a generation is damaged, the one before it counts. Another map than the latest is used only if the latest
+        belongs to another building: after a RESET, the old map must not return by itself.
+        A file with a name of the operator's choice is no generation of anything: where it is damaged, the next one
+        counts.
         """
         if self._lock is not None:
             self.trial.read()
@@ -140,7 +142,7 @@ class Store:
                 log.warning("%s: %d starts without %s have not lasted either; tried again", self.folder, MOST, them)
 
     def _newest(self, judge: Judge) -> Start | None:
-        """As :meth:`load`, of those that are not left out."""
+        """As :meth:`load`, without the excluded files."""
         self._origin, self.left_out = None, False
         try:
             generations = self.generations()
@@ -166,7 +168,7 @@ class Store:
                     self._refuse(generation.path, error)
                 except (BadMap, OSError) as error:
                     self._refuse(generation.path, error)
-                    elsewhere, refused = not generation.number, True  # what somebody has put there is no generation
+                    elsewhere, refused = not generation.number, True  # a file placed by the operator is no generation
                 else:
                     if refused:
                         log.warning("%s is used, the newest good generation of this map", generation.path)
@@ -184,7 +186,7 @@ class Store:
         return None
 
     def lasted(self) -> None:
-        """This run has lasted: what it was begun without is moved aside, all others are good."""
+        """Record that this run has lasted: its excluded files are moved aside, all others count as good."""
         if self._lock is None:
             return
         for name in self.trial.lasted():
@@ -228,13 +230,13 @@ class Store:
         return Start(content, stored, changed)
 
     def refuse(self, error: BadMap) -> None:
-        """The map that was loaded cannot be used after all: say why, and get it out of the way."""
+        """Log why the loaded map cannot be used after all, and move its file aside."""
         if self._origin is not None:
             self._refuse(self._origin, error)
             self._origin = None
 
     def _copy_aside(self, path: Path, content: bytes) -> Path:
-        """Keep a torn map for who wants to know: what is saved next lacks a part of it."""
+        """Copy a split map aside for diagnosis: the next save lacks a part of it."""
         aside = path.with_name(path.name + ".torn")
         with contextlib.suppress(OSError):
             if self._mend and not aside.exists():
@@ -243,7 +245,7 @@ class Store:
         return path
 
     def _refuse(self, path: Path, error: BadMap | OSError) -> None:
-        """Say why a file is not used; one that is damaged gets out of the way."""
+        """Log why a file is not used; a damaged one is moved aside."""
         self.damaged = True
         if isinstance(error, OSError):
             log.error("%s cannot be read: %s; mend that, or move it away", path, said(error))
@@ -256,11 +258,11 @@ class Store:
         log.error("%s is refused: %s; %s", where, error, error.remedy)
 
     def save(self, content: bytes, map_id: int) -> Path:
-        """Write a generation, verify it by reading it back, then let older ones go; returns its path.
+        """Write a generation, verify it by reading it back, then delete older ones; return its path.
 
         Raises:
-            OSError: it cannot be written or read, or another process uses the folder; what was there before stays.
-            BadMap: what was read back is not what was written; the file is kept aside.
+            OSError: it cannot be written or read, or another process uses the folder; the files before it stay.
+            BadMap: the content read back differs from the written one; the file is moved aside.
         """
         self._use()
         path = self.folder / f"map-{map_id:08x}-{self._next():08d}.lumimap"
@@ -275,14 +277,14 @@ class Store:
         return path
 
     def _drop_broken(self) -> None:
-        """A disk that does not keep what is written would fill up with what it has spoilt: the newest few stay."""
+        """Delete all but the newest damaged files: with a failing disk they would fill it up."""
         found = [(int(match[2]), path) for path in self.folder.iterdir() if (match := BROKEN_NAME.fullmatch(path.name))]
         for _, path in sorted(found)[:-MOST_BROKEN]:
             log.warning("%s goes: %d damaged maps are newer", path, MOST_BROKEN)
             path.unlink(missing_ok=True)
 
     def _use(self) -> None:
-        """Make the folder and take it for this process; what a killed one has left half written goes."""
+        """Create and lock the folder if necessary; temporary files of a killed process are deleted."""
         if self._lock is None or not self.folder.is_dir():
             self._take()
         self.trouble = ""
@@ -301,11 +303,11 @@ class Store:
         for part in self.folder.glob(".map-*.part"):
             try:
                 part.unlink(missing_ok=True)
-            except OSError as error:  # in nobody's way: the next map has another name
+            except OSError as error:  # harmless: the next map has another name
                 log.warning("%s cannot be removed: %s; it is left there", part, said(error))
 
     def _next(self) -> int:
-        """The number after all that were ever given, broken ones too."""
+        """Number above all that were ever used, damaged files included."""
         numbers = [int(match[2]) for path in self.folder.iterdir() if (match := NAME.match(path.name))]
         return 1 + max(numbers, default=0)
 
@@ -316,7 +318,7 @@ class Store:
         sync_folder(self.folder)
 
     def _superfluous(self, map_id: int) -> Iterator[Generation]:
-        """What newer files make up for: of this map the one just verified, of others one that has been read."""
+        """Generations that newer files replace: of this map the verified one, of others one that has been read."""
         others: dict[int, list[Generation]] = {}
         mine = 0
         for generation in self.generations():
@@ -338,11 +340,11 @@ class Store:
                 yield from files[: 1 + self._newest_good(files)]
 
     def _newest_good(self, files: list[Generation]) -> int:
-        """Place of the first generation of one map that can be read; their number where none can."""
+        """Index of the first generation of one map that can be read; their number where none can."""
         return next((place for place, generation in enumerate(files) if self._is_good(generation)), len(files))
 
     def _is_good(self, generation: Generation) -> bool:
-        """Whether a file can be read; each is looked at once, maps are large."""
+        """Whether a file can be read; the result is cached, because maps are large."""
         if generation.path not in self._good:
             try:
                 read(generation.path.read_bytes())
@@ -354,7 +356,7 @@ class Store:
         return self._good[generation.path]
 
     def close(self) -> None:
-        """Let others use the folder; idempotent."""
+        """Unlock the folder; idempotent."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None

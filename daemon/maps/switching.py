@@ -1,9 +1,9 @@
-"""SWITCH_MAP: the robot goes on in another stored map, while the daemon runs.
+"""Map switch (SWITCH_MAP): change to another stored map while the daemon runs.
 
-The map in use is saved, the other one is read and made into a state in a thread, and between two cycles the running
-state takes that one's map over. What the robot knows of itself stays: ``T_odom_base`` does not jump, odometry and
-velocity go on; where it is in the new map is looked for, as after a start in it. If anything on the way fails, nothing
-has changed.
+The map in use is saved. A thread reads the other one and builds an estimator state with it. Between two cycles the
+running state adopts that map.
+The robot's own motion continues: ``T_odom_base`` does not jump, odometry and velocity go on. Relocalisation finds the
+pose in the new map, as after a start in it. If any step fails, nothing has changed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from daemon.maps.store import Judge, Start, Store
 from daemon.system.callbacks import OnDone
 from hal.blocking_calls import run_in_thread
 
-if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+if TYPE_CHECKING:  # the warm-up loads the estimator in a thread
     from estimator import State
 
 log = logging.getLogger(__name__)
@@ -36,16 +36,16 @@ NO_FOLDER: Final = "maps are not kept: `map.folder` is none"
 NOT_LOADED: Final = "the estimator is still being loaded"
 NOTHING_COMES: Final = "nothing arrives from lidar, odometry or photodiode, so no cycle can take the map over"
 TAKEN_S: Final = 10.0
-"""A cycle that has something to work with takes the map within a scan; without any it is given up after this long."""
+"""Time limit in s: a cycle with records adopts the map within a scan; without one the switch is abandoned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Switch:
-    """A map that is ready to be gone on in.
+    """A loaded map that is ready for the switch.
 
     Attributes:
-        map_id, sha256: its identity, and of its content. donor: a state that has just been made with it. start: the
-            stored map.
+        map_id, sha256: its identity, and digest of its content. donor: a new state with this map. start: the stored
+            map.
     """
 
     map_id: int
@@ -55,9 +55,9 @@ class Switch:
 
 
 def take_over(state: State, donor: State) -> None:
-    """The running state goes on in the donor's map, detached in it; the donor is not to be used any more.
+    """Move the donor's map, still detached, into the running state; the donor must not be used afterwards.
 
-    Answers to what was asked about the old map will mean nothing: job numbers go on counting.
+    Results of jobs on the old map are ignored, because job numbers continue.
     """
     from estimator import forget_map, se2
 
@@ -77,11 +77,11 @@ def take_over(state: State, donor: State) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Maps:
-    """Where the maps are, and how they become states.
+    """Source of stored maps and of estimator states made with them.
 
     Attributes:
-        store: of maps; None: they are not kept. judge: whether a stored map fits what is configured of lights.
-        make: a state made with a stored map. keep: takes digest and content for a recording, and may raise OSError;
+        store: of maps; None: maps are not stored. judge: check of a stored map against the configured light setup.
+        make: builds a state with a stored map. keep: stores digest and content in a recording, and may raise OSError;
             None: nothing is recorded. Both are called in a thread.
     """
 
@@ -92,12 +92,12 @@ class Maps:
 
 
 class MapSwitch:
-    """Carries out one switch after the other.
+    """Carries out switches, one at a time.
 
     Args:
         autosaver: saves the map in use.
-        put: hands a switch to the cycle; its second argument is called once the cycle has taken it. None takes back
-            what has been handed over and not been taken.
+        put: hands a switch to the cycle; its second argument is called once the cycle has adopted it. None withdraws a
+            switch that has not been adopted.
     """
 
     def __init__(
@@ -107,9 +107,9 @@ class MapSwitch:
         self._task: asyncio.Task[None] | None = None
 
     def ask(self, map_id: int, on_done: OnDone, patient: bool = False) -> None:
-        """Go on in a stored map; ``on_done``: empty, or why that came to nothing.
+        """Switch to a stored map; ``on_done`` receives an empty text, or the reason of the failure.
 
-        ``patient``: wait for a cycle that takes it for as long as it may be; nobody waits for an answer.
+        ``patient``: wait for the cycle without a time limit, because no client waits for the result.
         """
         if self._task is not None and not self._task.done():
             on_done(BUSY)
@@ -119,7 +119,7 @@ class MapSwitch:
     async def _switch(self, map_id: int, on_done: OnDone, patient: bool) -> None:
         try:
             reason = await self._carried_out(map_id, patient)
-        except Exception as error:  # a defect must not leave the client waiting, and is told in full
+        except Exception as error:  # a defect must not leave the client waiting, and is logged in full
             log.exception("the map cannot be switched")
             reason = repr(error)
         on_done(reason)
@@ -158,13 +158,13 @@ class MapSwitch:
         return DONE
 
     async def _saved(self) -> str:
-        """The end of a save of the map in use."""
+        """Save the map in use and return the error, empty on success."""
         ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._autosaver.ask(lambda reason: None if ended.done() else ended.set_result(reason))
         return await ended
 
     def _load(self, store: Store, map_id: int) -> Switch:
-        """The stored map, made into a state; in a thread of its own."""
+        """Build a state with the stored map, in a thread of its own."""
         start = store.load_map(map_id, self._maps.judge)
         sha256 = hashlib.sha256(start.content).hexdigest()
         donor = self._maps.make(start)

@@ -1,8 +1,8 @@
-"""The map as tiles for whoever shows it: followed beside the estimator, which hears nothing of it.
+"""Map tiles for display clients, drawn beside the estimator, whose state is only read.
 
-Once a second the loop's thread looks what there is of submaps and keyframes, which are never changed, and a thread of
-lower priority draws (`estimator.mapping.live_grid`). The estimator's own state is only read, so that a run is the same
-with and without somebody who watches; and nobody who watches costs nothing.
+Once a second the loop's thread collects new submaps and keyframes, which are immutable, and a thread of lower priority
+draws them (`estimator.mapping.live_grid`). A run is therefore the same with and without clients. Without clients
+nothing is drawn.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
-if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+if TYPE_CHECKING:  # the warm-up loads the estimator in a thread
     from asyncio import AbstractEventLoop
 
     from estimator import Cells, Keyframe, LiveGrid, Progress, State, Submap, Task, Tile
@@ -25,13 +25,13 @@ log = logging.getLogger(__name__)
 
 RESOLUTION_M: Final = 0.05
 JOBS: Final = 8
-"""Pieces of work handed out in a row: some 20 ms each."""
+"""Largest number of consecutive drawing jobs, some 20 ms each."""
 
 AGAIN_S: Final = 30.0
-"""Drawing that has failed, for lack of memory perhaps, is tried again after this long."""
+"""Time in s after which failed drawing, for lack of memory perhaps, is tried again."""
 
 Tiles = dict[tuple[int, int], tuple[int, bytes]]
-"""By column and row: the version a tile is of, and its cells, deflated."""
+"""By column and row: the version of a tile, and its cells, deflated."""
 
 
 Shown = tuple[int, tuple[int, int]]
@@ -40,11 +40,11 @@ NOTHING_SHOWN: Final[Shown] = (0, (0, 0))
 
 
 class MapTiles:
-    """The tiles of the map in use.
+    """Tiles of the map in use.
 
     Attributes:
-        version: counts changes. tiles: all that have ever had something in them. error: why drawing has failed, empty
-            where it has not.
+        version: counts changes. tiles: all that were ever non-empty. error: reason why drawing failed, empty on
+            success.
     """
 
     def __init__(self, state: Callable[[], State | None], changed: Callable[[], None]) -> None:
@@ -62,7 +62,7 @@ class MapTiles:
         self._thread: ThreadPoolExecutor | None = None
 
     def follow(self, loop: AbstractEventLoop) -> None:
-        """Look what is new, and have it drawn; in the loop's thread, now and then, while somebody watches."""
+        """Collect changes of the map and start drawing; call it periodically in the loop's thread."""
         state = self._state()
         if state is None or self._busy or (self.error and loop.time() < self._again):
             return
@@ -73,18 +73,18 @@ class MapTiles:
 
     @property
     def busy(self) -> bool:
-        """Whether something is being drawn."""
+        """Whether drawing is in progress."""
         return self._busy
 
     def forget(self) -> None:
-        """Nobody watches any more."""
+        """Discard all tiles, because there are no clients."""
         if not self._busy:
             self.tiles, self._live, self._frames, self._seen = {}, None, {}, 0
             self.version += 1
             self.error = ""
 
     def close(self) -> None:
-        """Stop drawing, until it is followed again; idempotent."""
+        """Stop drawing until the next :meth:`follow`; idempotent."""
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.shutdown(wait=False, cancel_futures=True)
@@ -92,12 +92,12 @@ class MapTiles:
             self.forget()
 
     def since(self, shown: Shown) -> list[tuple[Shown, bytes]]:
-        """The tiles that come after one in the order of their versions, and of their places in each."""
+        """Tiles after ``shown``, ordered by version, then by column and row."""
         newer = [((version, tile), cells) for tile, (version, cells) in self.tiles.items()]
         return sorted(one for one in newer if one[0] > shown)
 
     def _look(self, state: State) -> None:
-        """Take in the keyframes that have come, and let go of submaps that have gone."""
+        """Add new keyframes, and remove submaps that the map does not contain any more."""
         from estimator import LiveGrid
 
         live = self._live
@@ -119,7 +119,7 @@ class MapTiles:
             del self._frames[key]
 
     def _let_go(self, live: LiveGrid, gone: list[int]) -> None:
-        """Submaps that are another map's, or of a part that was forgotten: what they have shown is drawn again."""
+        """Remove submaps of another map or of a discarded part; the area that they showed is drawn again."""
         if len(gone) == len(live.submaps):
             self._seen = 0  # another map
         for key in gone:
@@ -142,13 +142,13 @@ class MapTiles:
             try:
                 progress = advance(task)
                 done = progress, {tile: _packed(cells) for tile, cells in progress.tiles.items()}
-            except Exception:  # what is shown of the map must not harm who drives by it; told in full, once
+            except Exception:  # drawing must not affect localisation; the defect is logged in full, once
                 if not self.error:
                     log.exception("the map cannot be drawn for the stream; it is tried again every %.0f s", AGAIN_S)
             try:
                 loop.call_soon_threadsafe(self._take, live, done, adrift, left, loop)
             except RuntimeError:
-                return  # the loop has closed: nobody waits any more
+                return  # the loop has closed: no client waits any more
 
         self._thread.submit(work)
         self._busy = True
@@ -161,7 +161,7 @@ class MapTiles:
         left: int,
         loop: AbstractEventLoop,
     ) -> None:
-        """Take in what was drawn, and go on with it."""
+        """Apply the result of a drawing job, and start the next one."""
         if live is None or live is not self._live:
             return  # it was closed meanwhile
         self._busy = False
@@ -183,7 +183,7 @@ class MapTiles:
 
 
 def _step_back() -> None:
-    """The cycle goes first wherever both want the processor."""
+    """Lower the priority of the drawing thread, so that the cycle gets the processor first."""
     try:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
     except OSError:
@@ -199,7 +199,7 @@ def _adrift(state: State) -> float:
 
 
 def _stands(state: State, submap: Submap) -> bool:
-    """Whether a submap is a part of the map: in the graph, or in another one's place."""
+    """Whether a submap belongs to the map: in the graph itself, or merged into one that is."""
     while state.map.graph.submaps.get(submap.key) is not submap:
         if submap.into is None:
             return False
@@ -208,7 +208,7 @@ def _stands(state: State, submap: Submap) -> bool:
 
 
 def _newer(state: State, seen: int) -> list[Any]:
-    """Keyframes laid since, oldest first."""
+    """Keyframes created since, oldest first."""
     newer = []
     for key in reversed(state.map.keyframes):
         if key <= seen:

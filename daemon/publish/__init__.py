@@ -1,1 +1,1 @@
-"""Publishers: one snapshot, many forms (Modbus, UDP datagrams)."""
+"""Publishers: one snapshot, many forms (Modbus, UDP datagrams, local stream)."""

@@ -1,7 +1,7 @@
 """Allow-list for remote clients; loopback is always allowed.
 
-What comes from anywhere else is as good as not sent: a datagram is dropped, a connection is closed. This is no
-protection against one who can forge addresses on the network; it keeps the wrong machines out, not an attacker.
+Datagrams from any other address are dropped, and connections are closed. The list excludes wrong machines. It does not
+protect against an attacker who can forge addresses on the network.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from daemon.config.endpoints import parse_network
 log = logging.getLogger(__name__)
 
 TOLD: Final = 16
-"""Refused hosts that are named in the log; a crowd of them must not fill it."""
+"""Largest number of refused hosts that the log names; more would fill it."""
 REMEMBERED: Final = 1024
 
 
 class Access:
-    """Says of a host whether it may be answered.
+    """Callable that decides whether a host is allowed.
 
     Args:
-        networks: allowed ones; empty: everyone. bind: where the servers listen: this computer reaches them from there.
+        networks: allowed ones; empty: everyone. bind: address on which the servers listen, from which this computer
+            itself connects.
 
     Attributes:
-        refused: datagrams and connections that were turned away.
+        refused: datagrams and connections that were rejected.
     """
 
     def __init__(self, networks: Sequence[str] = (), bind: str = "") -> None:
@@ -39,7 +40,7 @@ class Access:
         self.refused = 0
 
     def __call__(self, host: str) -> bool:
-        """Whether this address may be answered."""
+        """Whether this address is allowed."""
         if not self._networks or self._knows(host):
             return True
         self.refused += 1

@@ -1,7 +1,7 @@
 """Commands from Modbus: dispatches each to its handler and returns its outcome to the client.
 
-A controller may repeat an order at any rate (it writes a new number in every turn of its program): the log then gets
-some of them and their count.
+A controller may repeat a command at any rate (it writes a new number in every program cycle). The log then contains
+some of them and the count of the others.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ log = logging.getLogger(__name__)
 NO_RECORDER: Final = "this run keeps no flight recorder: start it with --record DIR --last MINUTES"
 NO_MAPS: Final = "this run stores no maps: set map.folder"
 ASKED: Final = 8
-"""Requests that are waited for, the latest: a client hears of its last one only."""
+"""Largest number of pending requests, the latest ones: the acknowledge register holds only the last one of a client."""
 
 
 @dataclass(slots=True)
 class _Asked:
-    """A request whose cycle has yet to publish; ``placed``: it is done when there is a pose."""
+    """Request whose cycle has yet to publish; ``placed``: it is done only when there is a pose."""
 
     number: int
     placed: bool
 
 
 class Orders:
-    """Hands orders on.
+    """Dispatcher of client commands.
 
     Args:
-        acknowledge: tells the client what became of its request.
+        acknowledge: reports the outcome of a request to the client.
     """
 
     def __init__(self, clock: Clock, feeds: Feeds, acknowledge: Callable[[int, Outcome], None]) -> None:
@@ -54,13 +54,15 @@ class Orders:
         self._lines = Sparing(log)
 
     def handle(self, request: Request) -> None:
-        """An order as it was written; whatever goes wrong with it, the client hears of its end."""
+        """Carry out a written command; after any failure the client gets an outcome."""
         self._lines.say(self._clock.now(), logging.INFO, f"Modbus: {_said(request)}")
         on_done = partial(self._ended, request)
         try:
             self._hand_on(request, on_done)
         except Exception as failure:
-            log.debug("%s has failed", request.code.name, exc_info=True)  # at any rate: above, it would fill the log
+            log.debug(
+                "%s has failed", request.code.name, exc_info=True
+            )  # debug only: at a client's rate it would fill the log
             on_done(f"it has failed: {failure!r}")
 
     def _hand_on(self, request: Request, on_done: OnDone) -> None:
@@ -75,7 +77,7 @@ class Orders:
             self._to_cycle(request)
 
     def _to_cycle(self, request: Request) -> None:
-        """Carried out by the next cycle."""
+        """Put the command into the inbox of the next cycle."""
         order = Order[request.code.name]
         pose = np.array(request.pose) if order is Order.SET_POSE else None
         self._feeds.on_command(Command(self._clock.now(), order, pose))
@@ -83,7 +85,7 @@ class Orders:
         self._asked = [*self._asked, asked][-ASKED:]
 
     def published(self, snapshot: Snapshot) -> None:
-        """The cycle that took the orders has published: they are done; a sink of the cycle."""
+        """Sink of the cycle: report the commands that this cycle has carried out as done."""
         if self._asked:
             placed = snapshot.pose is not None
             done = [asked for asked in self._asked if placed or not asked.placed]
@@ -98,6 +100,6 @@ class Orders:
 
 
 def _said(request: Request) -> str:
-    """The order with what it carries."""
+    """Text of a command with its parameters, for the log."""
     carried = {CommandCode.SET_POSE: f" {request.pose}", CommandCode.SWITCH_MAP: f" {request.map_id:08x}"}
     return request.code.name + carried.get(request.code, "")

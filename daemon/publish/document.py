@@ -1,4 +1,4 @@
-"""Writes `docs/modbus.md` and `docs/udp.md` from the tables: `python -m daemon.publish.document [FOLDER]`."""
+"""Generator of `docs/modbus.md` and `docs/udp.md` from the tables: `python -m daemon.publish.document [FOLDER]`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _span(block: Block) -> tuple[int, int]:
 
 
 def _whole(block: Block, rows: Sequence[tuple[str, ...]] = ()) -> str:
-    """The table of a block from its magic to its end; `rows` stand in for its points where they repeat."""
+    """Markdown table of a block from its magic to its end; `rows` replace its points where they repeat."""
     first, last = _span(block)
     tag = block.magic.to_bytes(2, "big").decode()
     return table(
@@ -299,7 +299,7 @@ def write(folder: Path) -> None:
 
 
 def main() -> None:
-    """The command."""
+    """Command-line entry point."""
     parser = argparse.ArgumentParser(
         prog="python -m daemon.publish.document", description=f"Write {' and '.join(pages())} from the daemon's tables."
     )

@@ -1,4 +1,4 @@
-"""Rows and tables of the documents that are written from the published tables."""
+"""Markdown tables for the generated protocol documents, made from the published tables."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _describe(point: Point) -> str:
 
 
 def layout_rows(layout: Layout, start: int, step: int) -> list[tuple[str, ...]]:
-    """Rows of a layout; `start` and `step` turn a word offset into a register address or a byte."""
+    """Rows of a layout; `start` and `step` convert a word offset to a register address or a byte."""
     return [
         (str(start + step * offset), f"`{p.name}`", p.wire.name, _step(p), _not_known(p), _describe(p))
         for offset, p in zip(layout.offsets, layout.points, strict=True)
@@ -46,7 +46,7 @@ def layout_rows(layout: Layout, start: int, step: int) -> list[tuple[str, ...]]:
 
 
 def holding_rows(layout: Layout, start: int) -> list[tuple[str, ...]]:
-    """The same with who may write."""
+    """The same rows with the permitted access."""
     return [
         (str(start + offset), f"`{p.name}`", p.wire.name, p.access, _step(p), _not_known(p), _describe(p))
         for offset, p in zip(layout.offsets, layout.points, strict=True)

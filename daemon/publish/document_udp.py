@@ -1,4 +1,4 @@
-"""The page `docs/udp.md`, written from the tables."""
+"""Generator of the page `docs/udp.md` from the tables."""
 
 from __future__ import annotations
 

@@ -15,11 +15,11 @@ OnOdometry = Callable[[RawOdometry], None]
 
 @dataclass(frozen=True, slots=True)
 class Feeds:
-    """Who takes what comes in.
+    """Receivers of network input.
 
-    ``on_save`` is asked to save the map, ``on_dump`` to write the flight recorder, ``on_switch`` to go on in another
-    map; each tells the end of it: empty, or why it came to nothing. What is None is refused. ``on_loop_seen``: how many
-    loops a client has seen.
+    ``on_save`` saves the map, ``on_dump`` writes the flight recorder, ``on_switch`` changes to another map. Each
+    reports its end: empty on success, otherwise the reason. A request whose callback is None is refused.
+    ``on_loop_seen`` receives the number of loop closures that a client has acknowledged.
     """
 
     on_odometry: OnOdometry

@@ -1,4 +1,4 @@
-"""What the published numbers mean, in words, beside those that have a table of their own (faults, reasons, points)."""
+"""Texts for published numbers (states, link uses, fixes, loop reasons) that have no table of their own elsewhere."""
 
 from __future__ import annotations
 

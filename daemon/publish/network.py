@@ -1,6 +1,6 @@
-"""The daemon's sockets: Modbus, pose datagrams, and the port that takes odometry and gyro readings.
+"""Network services: Modbus, pose datagrams, local stream, and the input port of odometry and gyro readings.
 
-Each is a part that the supervisor keeps running, and imported only if it is configured.
+Each is a component of the supervisor, and is imported only if it is configured.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CALM_S: Final = 60.0
-"""That one is ignored is said again when it has not happened for so long."""
+"""Time in s without an ignored reading after which the next one is logged again."""
 
 Run = Callable[[], Awaitable[None]]
 
 
 class OneSender:
-    """Lets one sender of odometry through at a time: two cumulative poses have nothing to do with each other."""
+    """Filter that accepts one sender of odometry at a time: two cumulative poses are unrelated."""
 
     def __init__(self, on_odometry: OnOdometry) -> None:
         self.refused = 0
@@ -46,7 +46,7 @@ class OneSender:
         self._heard = 0.0
 
     def receive(self, sender: str, reading: RawOdometry) -> None:
-        """Pass a reading on if its sender has the floor."""
+        """Pass a reading on if it is the present sender's, or if that one has timed out."""
         if sender != self._sender and self._sender and reading.t_rx - self._heard <= ODOMETRY_SILENT_S:
             self.refused += 1
             if reading.t_rx - self._refused_at > CALM_S:
@@ -58,10 +58,10 @@ class OneSender:
 
 
 class Network:
-    """Everything that listens or sends.
+    """All configured network services.
 
     Attributes:
-        sinks: take every snapshot. parts: by name, for the supervisor. modbus, pose, stream: None: there is none.
+        sinks: receive every snapshot. parts: by name, for the supervisor. modbus, pose, stream: None: not configured.
     """
 
     def __init__(self, settings: Config, clock: Clock, feeds: Feeds, stream: Path | None = None) -> None:
@@ -86,7 +86,7 @@ class Network:
 
     @property
     def failing(self) -> set[str]:
-        """Parts that run and cannot do their work at the moment."""
+        """Names of components that run but cannot do their work at present."""
         return {"pose"} if self.pose is not None and self.pose.failing else set()
 
     def _add_modbus(self, settings: ModbusConfig) -> None:
@@ -141,12 +141,12 @@ class Network:
         self.parts["imu"] = lambda: port.imu.run(on_imu)
 
     def _from(self, sender: str) -> OnOdometry:
-        """A callback for one sender's readings."""
+        """Callback for the readings of one sender."""
         return lambda reading: self._odometry.receive(sender, reading)
 
 
 async def _open(start: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]) -> None:
-    """A part that works by itself between its start and its close."""
+    """Run a component that works by callbacks: start it, wait for ever, and close it at the end."""
     await start()
     try:
         await asyncio.Event().wait()

@@ -1,7 +1,7 @@
-"""The process of this computer that owns a port, and whether it is the intended daemon.
+"""Process of this computer that owns a port, and whether it is the intended daemon.
 
-Modbus does not say whose registers it shows. The kernel knows: who has the socket, and who listens at the local stream.
-Standard library only, as the command that asks.
+Modbus does not contain the identity of the daemon. The kernel has it: which process owns the socket, and which one
+listens at the local stream. The module uses the standard library only, like the command that needs it.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ _PATIENCE_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Whose:
-    """Who answers: process ``pid``, 0: not to be seen, started by ``command``; ``meant``: that of the name, 0: none.
+    """Owner of a port and the intended daemon.
 
-    ``apart``: the latter has a network of its own (a container), whose ports others pass on.
+    ``pid``: owning process (0: not visible). ``command``: its command line. ``meant``: process of the intended daemon
+    (0: none).
+    ``apart``: the intended daemon has a network of its own (a container), whose ports others forward.
     """
 
     pid: int
@@ -36,7 +38,7 @@ class Whose:
 
     @property
     def another(self) -> bool:
-        """Whether it is another daemon than the one that was meant, which runs and has not got the port."""
+        """Whether the owner is another daemon than the intended one, which runs without the port."""
         return 0 not in (self.pid, self.meant) and self.pid != self.meant and not self.apart
 
     def __str__(self) -> str:
@@ -48,20 +50,20 @@ class Whose:
 
 
 def whose(of: str | Path, host: str, port: int) -> Whose:
-    """Who answers at a UDP port of this computer, and who is the daemon of that name or stream; unseen ones are 0."""
+    """Owner of a UDP port of this computer, and the daemon of that name or stream; invisible ones are 0."""
     meant = _listener(of if isinstance(of, Path) else stream_path(of))
     inodes = _sockets(host, port)
     holders = dict(_holders(inodes))
     pid = 0
     if meant in holders:
         pid = meant
-    elif inodes == set().union(*holders.values()):  # else the one that is not to be seen may be who answers
+    elif inodes == set().union(*holders.values()):  # otherwise an invisible process may be the owner
         pid = next(iter(holders), 0)
     return Whose(pid, _command(pid), meant, _apart(meant))
 
 
 def _listener(path: Path) -> int:
-    """The process that listens at a local socket."""
+    """Process that listens at a local socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock, contextlib.suppress(OSError):
         sock.settimeout(_PATIENCE_S)
         sock.connect(str(path))
@@ -71,10 +73,10 @@ def _listener(path: Path) -> int:
 
 
 def _sockets(host: str, port: int) -> set[str]:
-    """The inodes of the UDP sockets that get what is sent to an address and a port.
+    """Inodes of the UDP sockets that receive datagrams to an address and a port.
 
-    As in the kernel those that are bound to the address itself go before those of every address, and these before those
-    of the other family, which take IPv4 too.
+    The kernel's order applies: sockets bound to the address itself first, then those of every address, then those of
+    the other family, which also receive IPv4.
     """
     bound: dict[str, set[str]] = {}
     for table in ("udp", "udp6"):
@@ -89,14 +91,14 @@ def _sockets(host: str, port: int) -> set[str]:
 
 
 def _written(address: str) -> str:
-    """An address as people write it; the kernel's tables have it in words of the computer's own byte order."""
+    """An address in usual notation; the kernel's tables contain it as words in the computer's byte order."""
     words = [int(address[at : at + 8], 16) for at in range(0, len(address), 8)]
     family = socket.AF_INET if len(words) == 1 else socket.AF_INET6
     return socket.inet_ntop(family, b"".join(word.to_bytes(4, sys.byteorder) for word in words))
 
 
 def _holders(inodes: set[str]) -> Iterator[tuple[int, set[str]]]:
-    """The processes that have some of these sockets open, as far as we may look into them, and which."""
+    """Processes that have some of these sockets open, with the sockets, as far as permissions show."""
     names = {f"socket:[{inode}]": inode for inode in inodes}
     for process in PROC.iterdir() if names else ():
         if process.name.isdecimal():
@@ -106,7 +108,7 @@ def _holders(inodes: set[str]) -> Iterator[tuple[int, set[str]]]:
 
 
 def _apart(pid: int) -> bool:
-    """Whether a process is known to have another network than this one."""
+    """Whether a process is in a network namespace other than this one."""
     theirs, ours = (_link(PROC / who / "ns" / "net") for who in (str(pid), "self"))
     return bool(theirs) and bool(ours) and theirs != ours
 
@@ -119,7 +121,7 @@ def _link(file: Path) -> str:
 
 
 def _command(pid: int) -> str:
-    """A process's command line; what is no letter, and might be an order to the terminal, is written out."""
+    """Command line of a process; characters that might control the terminal are escaped."""
     line = ""
     with contextlib.suppress(OSError):
         if pid:

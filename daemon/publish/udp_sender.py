@@ -1,7 +1,7 @@
-"""Pose datagrams to configured receivers, single ones and multicast groups, and to whoever has subscribed.
+"""UDP pose datagrams to configured receivers (unicast and multicast) and to subscribers.
 
-Nothing here waits: what the kernel does not take at once is dropped. Datagrams to a group are sent once however many
-listen, and do not leave the local network (time to live 1, RFC 1112).
+No call waits: a datagram that the kernel does not accept at once is dropped. A datagram to a group is sent once for all
+listeners, and does not leave the local network (time to live 1, RFC 1112).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from daemon.snapshot import Snapshot
 from hal.errors import DeviceMissing
 from hal.net import inet
 
-RETRY_S: Final = 5.0  # a name that could not be looked up (the network often comes up after the robot's programs)
+RETRY_S: Final = 5.0  # of a failed name lookup: the network often starts after the robot's programs
 REFRESH_S: Final = 300.0  # a name's address may move to another computer
 
 log = logging.getLogger(__name__)
@@ -28,11 +28,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class Receiver:
-    """One configured receiver and what became of its datagrams.
+    """One configured receiver and the result of its datagrams.
 
     Attributes:
-        name: as configured. sent, dropped: datagrams; dropped ones were not taken by the kernel, or the receiver's
-            name was not known. address: None while the name is not known.
+        name: as configured. sent, dropped: datagrams; a dropped one was not accepted by the kernel, or the receiver's
+            name was not resolved. address: None while the name is not resolved.
     """
 
     name: str
@@ -48,9 +48,9 @@ class PoseSender:
     """Sends each snapshot as one datagram to every receiver.
 
     Args:
-        receivers: as `daemon.config.endpoints.parse_endpoint` takes them.
-        interface: address of this computer from which groups are sent to; empty: as the system routes them.
-        subscriptions: who has asked for datagrams; None: nobody can.
+        receivers: as `daemon.config.endpoints.parse_endpoint` accepts them.
+        interface: address of this computer from which multicast is sent; empty: the system's route.
+        subscriptions: present subscribers; None: no subscriptions.
 
     Raises:
         ValueError: a receiver that is not of that form.
@@ -66,7 +66,7 @@ class PoseSender:
         self._lookups: list[asyncio.Task[None]] = []
 
     async def start(self) -> None:
-        """Find the receivers' addresses: numeric ones at once, names beside the loop and again every few minutes."""
+        """Resolve the receivers' addresses: numeric ones at once, names beside the loop and again every few minutes."""
         for receiver in self.receivers:
             if found := inet.numeric(receiver.host, receiver.port):
                 receiver.address = found[0]
@@ -75,11 +75,11 @@ class PoseSender:
 
     @property
     def failing(self) -> bool:
-        """Whether a configured receiver cannot be sent to: the network is gone, or its name is not known."""
+        """Whether a configured receiver is unreachable: the network is down, or its name is not resolved."""
         return not all(receiver.reachable for receiver in self.receivers)
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Send to all; never waits, never raises for the network."""
+        """Send to all; never waits, and raises nothing for network errors."""
         subscribed = self._subscriptions is not None and len(self._subscriptions.leases) > 0
         if not self.receivers and not subscribed:
             return
@@ -90,7 +90,7 @@ class PoseSender:
             self._subscriptions.send(data)
 
     async def close(self) -> None:
-        """Stop; idempotent."""
+        """Stop sending; idempotent."""
         lookups, self._lookups = self._lookups, []
         for task in lookups:
             task.cancel()
@@ -121,7 +121,7 @@ class PoseSender:
                 log.info("pose receiver %s can be reached again", receiver.name)
 
     def _open(self, family: socket.AddressFamily, interface: int) -> socket.socket:
-        """A socket to send from; datagrams to groups leave by the interface that was named."""
+        """Open a socket for sending; multicast uses the given interface."""
         sock = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         try:
             if family == socket.AF_INET and self._interface:
@@ -134,7 +134,7 @@ class PoseSender:
         return sock
 
     def _lost(self, receiver: Receiver, problem: str) -> None:
-        """Say it once; the warning is the heartbeat's, with the fault's number."""
+        """Log the loss of a receiver once; the heartbeat gives the warning, with the fault's number."""
         if receiver.reachable:
             receiver.reachable = False
             log.info("pose receiver %s: %s; datagrams to it are dropped until it is back", receiver.name, problem)
@@ -148,7 +148,7 @@ class PoseSender:
                 if receiver.address is None:
                     self._lost(receiver, error.problem)
                 pause = RETRY_S
-            except Exception:  # such as no thread left: the receiver is not to be given up for that
+            except Exception:  # such as no thread left: the receiver is tried again later
                 log.exception("pose receiver %s cannot be looked up; it is tried again", receiver.name)
                 pause = RETRY_S
             await asyncio.sleep(pause)

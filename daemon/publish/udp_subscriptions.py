@@ -1,8 +1,8 @@
-"""Pose datagrams for whoever asks: a small datagram subscribes for a while, and again before that is over.
+"""UDP subscription protocol for pose datagrams: leases that clients request and renew with a cookie.
 
-Nobody can turn this against a third party: an address first gets a *cookie*, in an answer no larger than its request,
-and datagrams only once it has sent the cookie back. The cookie is a keyed hash of address and time, so nothing is kept
-of those that never come back. Subscribers are few, leases are short.
+The protocol cannot direct datagrams to a third party. An address first receives a *cookie*, in a reply no larger than
+its request, and pose datagrams only after it has returned the cookie. The cookie is a keyed hash of address and time,
+so the daemon stores nothing for addresses that never reply. Subscribers are few, leases are short.
 
     "LUSB", version u16, length u16, status u16, lease u16, cookie u64, CRC-32    24 bytes, little-endian, both ways
 """
@@ -32,11 +32,11 @@ VERSION: Final = 1
 SUBSCRIBERS: Final = 16
 LONGEST_LEASE_S: Final = 60
 COOKIE_S: Final = 120.0
-"""A cookie is good for one to two of these."""
+"""Period of the cookie's time input, s: a cookie is valid for one to two periods."""
 LAYOUT: Final = (
     ("magic", "4s"), ("version", "H"), ("length", "H"), ("status", "H"), ("lease", "H"), ("cookie", "Q"),
 )  # fmt: skip
-"""Fields before the CRC-32, little-endian, of a request and of its answer (codes of the `struct` module)."""
+"""Fields before the CRC-32, little-endian, of a request and of its reply (codes of the `struct` module)."""
 _BODY: Final = struct.Struct("<" + "".join(code for _, code in LAYOUT))
 _CRC: Final = struct.Struct("<I")
 SIZE: Final = _BODY.size + _CRC.size
@@ -46,12 +46,12 @@ log = logging.getLogger(__name__)
 
 
 class Status(IntEnum):
-    """What a subscription datagram says. Numbers are part of the contract: never renumber."""
+    """Status field of a subscription datagram. Numbers are part of the contract: never renumber."""
 
-    ASK = 0  # client: send me pose datagrams for `lease` seconds; 0: no more
-    COOKIE = 1  # daemon: ask again with this cookie
+    ASK = 0  # client: requests pose datagrams for `lease` seconds; 0: ends them
+    COOKIE = 1  # daemon: repeat the request with this cookie
     GRANTED = 2  # daemon: for `lease` seconds from now
-    FULL = 3  # daemon: there are as many subscribers as can be
+    FULL = 3  # daemon: the largest number of subscribers is reached
     ENDED = 4  # daemon: no more are sent
 
 
@@ -65,13 +65,13 @@ class Message:
 
 
 def encode(message: Message) -> bytes:
-    """The bytes of a datagram."""
+    """Encode a subscription datagram."""
     body = _BODY.pack(MAGIC, VERSION, SIZE, message.status, message.lease, message.cookie)
     return body + _CRC.pack(zlib.crc32(body))
 
 
 def decode(data: bytes) -> Message:
-    """A datagram's message.
+    """Decode a subscription datagram.
 
     Raises:
         ValueError: not a subscription datagram of this version, or damaged.
@@ -85,12 +85,12 @@ def decode(data: bytes) -> Message:
 
 
 class Leases:
-    """Who is subscribed until when. Pure: told the time, sends nothing.
+    """Subscribers with the end of their leases. Pure: the time is an argument, and nothing is sent.
 
-    A peer is whatever tells one from another: address, and that of ours which was asked.
+    A peer is a hashable key: the client's address, and our address to which it sent.
 
     Attributes:
-        refused: requests that came while the house was full.
+        refused: requests rejected because the largest number of subscribers was reached.
     """
 
     def __init__(self, key: bytes | None = None) -> None:
@@ -102,7 +102,7 @@ class Leases:
         return len(self._until)
 
     def answer(self, peer: Any, message: Message, now: float) -> Message | None:
-        """The answer to a client's datagram; None for what is no request."""
+        """Reply to a client's datagram; None for a datagram that is no request."""
         if message.status is not Status.ASK:
             return None
         if message.cookie not in (self._cookie(peer, now), self._cookie(peer, now - COOKIE_S)):
@@ -119,7 +119,7 @@ class Leases:
         return Message(Status.GRANTED, lease, self._cookie(peer, now))
 
     def peers(self, now: float) -> list[Any]:
-        """Addresses to send to now."""
+        """Peers with a valid lease."""
         self._expire(now)
         return list(self._until)
 
@@ -133,14 +133,15 @@ class Leases:
 
 
 class Subscriptions:
-    """Listens for subscribers and sends them what it is given, from the same port.
+    """Socket that receives subscription requests, and sends datagrams to the subscribers from the same port.
 
     Args:
-        bind: address of this computer. port: 0: any free one, told by :attr:`port` once open.
-        allowed: whether a host may be answered.
+        bind: address of this computer. port: 0: any free one, available as :attr:`port` once open.
+        allowed: whether a host may subscribe.
 
     Attributes:
-        sent, dropped: datagrams; dropped ones were not taken by the kernel. malformed: datagrams that were no request.
+        sent, dropped: datagrams; dropped ones were not accepted by the kernel. malformed: datagrams that were no
+            request.
     """
 
     def __init__(self, bind: str, port: int, allowed: Callable[[str], bool]) -> None:
@@ -150,9 +151,9 @@ class Subscriptions:
         self._wanted = port
         self._allowed = allowed
         self._sock: socket.socket | None = None
-        self._space = 0  # for what the kernel tells about a datagram
+        self._space = 0  # size of the kernel's ancillary data of a datagram
         self._reader: Reader | None = None
-        self._lines = Sparing(log, lines=1)  # one who comes and goes all the time must not fill the log
+        self._lines = Sparing(log, lines=1)  # a client that subscribes and ends repeatedly must not fill the log
 
     @property
     def port(self) -> int:
@@ -160,7 +161,7 @@ class Subscriptions:
         return self._wanted if self._sock is None else int(self._sock.getsockname()[1])
 
     async def start(self) -> None:
-        """Listen.
+        """Open the socket and serve requests.
 
         Raises:
             DeviceRefused: port in use, or not permitted. DeviceMissing: no such address here.
@@ -175,7 +176,7 @@ class Subscriptions:
         self._reader = Reader(self._sock.fileno(), partial(self._serve, self._sock), Share())
 
     async def close(self) -> None:
-        """Stop; idempotent. Leases outlive it."""
+        """Close the socket; idempotent. Leases stay valid."""
         sock, self._sock = self._sock, None
         if self._reader is not None:
             self._reader.close()
@@ -202,7 +203,7 @@ class Subscriptions:
         for _ in range(_PER_TURN):
             try:
                 data, told, _, peer = sock.recvmsg(SIZE + 1, self._space)
-            except OSError:  # nothing more, or the network's complaint about an earlier datagram
+            except OSError:  # no more data, or a network error caused by an earlier datagram
                 return
             if not self._allowed(peer[0]):
                 continue

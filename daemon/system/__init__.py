@@ -1,1 +1,1 @@
-"""What the daemon needs of the operating system: files, logging, the service manager, scheduling, versions."""
+"""Operating system services for the daemon: files, logging, service manager, scheduling, versions."""

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and survive a power cut once they are there."""
+"""Atomic file writing: a file appears whole or not at all, and survives a power cut once written."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write beside the place, sync, move there; raises `OSError`, and then what was there before stays."""
+    """Write a file atomically: temporary file, sync, rename. On `OSError` the previous content stays."""
     beside = path.with_name(f".{path.name}.part")
     try:
         with beside.open("wb") as file:
@@ -24,17 +24,17 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def reason_of(error: Exception) -> str:
-    """Why something could not be written, for people: the system's words where it has some."""
+    """Readable reason why something could not be written: the system's message where there is one."""
     return (error.strerror if isinstance(error, OSError) else None) or repr(error)
 
 
 def defect_in(error: Exception) -> Exception | None:
-    """What a log tells in full: whatever is more than the system's refusal."""
+    """The exception for a traceback in the log; None for an `OSError`, whose message suffices."""
     return None if isinstance(error, OSError) else error
 
 
 def sync_folder(folder: Path) -> None:
-    """Make a new file's name survive a power cut, too."""
+    """Sync a folder, so that a new file name in it survives a power cut."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

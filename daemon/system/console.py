@@ -1,6 +1,6 @@
-"""What every command prints on stderr, and its exit codes.
+"""Console output of commands on stderr, and their exit codes.
 
-Exit codes: 0 done, 1 it failed (the text says what and what to do), 2 wrong usage or configuration, 130 interrupted.
+Exit codes: 0 done, 1 failed (the text states why and the remedy), 2 wrong usage or configuration, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ INTERRUPTED: Final = 130
 
 
 def fail(message: str, code: int = FAILED) -> int:
-    """Print on stderr what went wrong and return the exit code."""
+    """Print an error message on stderr and return the exit code."""
     sys.stderr.write(f"lumiloop: {message}\n")
     return code
 
 
 def progress(text: str) -> None:
-    """One line on stderr: overwritten on a terminal, one below the other elsewhere."""
+    """Print a progress line on stderr: overwritten on a terminal, appended elsewhere."""
     sys.stderr.write(f"\r\x1b[K{text}" if sys.stderr.isatty() else f"{text}\n")
     sys.stderr.flush()
 
 
 def say(text: str) -> None:
-    """Print one line on stderr, at once."""
+    """Print one line on stderr and flush it."""
     sys.stderr.write(f"lumiloop: {text}\n")
     sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""Libraries that only some commands need: how to have them."""
+"""Optional dependencies of some commands: how to install them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from importlib.util import find_spec
 
 
 def how_to_install(extra: str) -> str:
-    """The command that adds an ``extra`` to this installation; one as a service has no pip of its own."""
+    """Command line that adds the optional dependencies ``extra`` to this installation.
+
+    A service installation has no pip of its own.
+    """
     pip = "pip" if find_spec("pip") else f"python3 -m pip --python {sys.executable}"
     return f"{pip} install 'lumiloop[{extra}]'"

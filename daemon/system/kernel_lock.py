@@ -1,8 +1,8 @@
-"""The lock of the folder of compiled kernels: a process that compiles holds it; one that only loads needs none.
+"""File lock for the cache of compiled kernels: a compiling process holds it; a process that only loads needs none.
 
-numba writes each file of its cache beside and renames it: who reads meets a whole one or none, and compiles the kernel
-of which there is none. So nothing has to be waited for where all are there, whatever others do. Two who compile at once
-would do the same work twice, and could spoil the cache's index.
+numba writes each cache file under a temporary name and renames it. A reader therefore finds a complete file or none,
+and compiles a kernel that is missing. A process that finds all kernels never waits.
+Two processes that compile at once would do the same work twice and could damage the cache's index.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import IO, Final, Self
 log = logging.getLogger(__name__)
 
 waits: Final = threading.Event()
-"""Whether this process waits for one that compiles."""
+"""Set while this process waits for another one that compiles."""
 
 
 class KernelLock:
-    """Taken when it is needed, held until the block ends.
+    """Exclusive lock that :meth:`acquire` takes on demand and the end of the ``with`` block releases.
 
     Args:
         folder: of compiled kernels.
@@ -41,7 +41,7 @@ class KernelLock:
             self._file = None
 
     def acquire(self) -> None:
-        """Have it from now on; says so where another process has it, and waits.
+        """Take the lock; if another process holds it, log that and wait.
 
         Raises:
             OSError: the folder cannot be written to.
@@ -62,7 +62,7 @@ class KernelLock:
 
 @contextlib.contextmanager
 def before_compiling(call: Callable[[], None]) -> Iterator[None]:
-    """``call`` before anything is compiled meanwhile, in the thread that compiles."""
+    """Context in which ``call`` runs before each compilation, in the compiling thread."""
     from numba.core import event
 
     class Before(event.Listener):

@@ -1,4 +1,4 @@
-"""Where the daemon's log goes: fields to the journal where the service manager runs it, plain lines to a terminal."""
+"""Log output: structured fields to the systemd journal under the service manager, plain lines to a terminal."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from typing import Final
 JOURNAL: Final = Path("/run/systemd/journal/socket")
 TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
 PRIORITY: Final = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
-"""Of syslog(3), by level."""
+"""Priority of syslog(3), by level."""
 LONGEST: Final = 32_768
-"""Bytes of a message that are kept: a datagram has to take it."""
+"""Longest message in bytes: it has to fit into one datagram."""
 
 Fields = Mapping[str, object]
 
 
 class Sparing:
-    """Lines about what others do at a rate of their own: so many in a while, then only how many more there were.
+    """Rate limiter of log lines for events at a rate that others control; suppressed lines are counted.
 
     Args:
-        log: gets the lines. lines, seconds: so many are told in so many seconds.
+        log: receives the lines. lines, seconds: largest number of lines in an interval of this length (s).
     """
 
     def __init__(self, log: logging.Logger, lines: int = 10, seconds: float = 10.0) -> None:
@@ -34,7 +34,7 @@ class Sparing:
         self._told = self._left_out = 0
 
     def say(self, t_mono: float, level: int, text: str) -> None:
-        """Tell it, or count it."""
+        """Log the line, or count it if the limit of the interval is reached."""
         if t_mono >= self._until:
             self._until, self._told = t_mono + self._seconds, 0
         if self._told == self._lines:
@@ -46,7 +46,7 @@ class Sparing:
 
 
 def start_log() -> None:
-    """Log to the journal where stderr is the journal's own stream, else to stderr with the time of day."""
+    """Start logging: to the journal where stderr is its own stream, otherwise to stderr with the time of day."""
     handler: logging.Handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter(TERMINAL_FORMAT))
     if to_journal():
@@ -66,10 +66,11 @@ def to_journal() -> bool:
 
 
 class JournalHandler(logging.Handler):
-    """Sends each line with its fields in the journal's native protocol (https://systemd.io/JOURNAL_NATIVE_PROTOCOL).
+    """Log handler that sends each line with its fields in the journal's native protocol.
 
-    Never waits: a journal that takes nothing just now loses the line, which is counted and said with the next one that
-    gets through. Where the socket is missing, ``otherwise`` takes the lines.
+    The protocol is https://systemd.io/JOURNAL_NATIVE_PROTOCOL.
+    It never waits: a line that the journal does not accept at once is lost. The next line that gets through contains
+    the count. Where the socket is missing, ``otherwise`` receives the lines.
     """
 
     def __init__(self, path: Path, otherwise: logging.Handler) -> None:
@@ -111,7 +112,7 @@ class JournalHandler(logging.Handler):
 
 
 def packed(fields: Fields) -> bytes:
-    """One entry of the native protocol: a value that has line feeds in it goes with its length."""
+    """Encode one entry of the native protocol; a value with line feeds is preceded by its length."""
     parts = []
     for name, value in fields.items():
         data = str(value).encode(errors="replace")
@@ -123,7 +124,7 @@ def packed(fields: Fields) -> bytes:
 
 
 class _PriorityFormat(logging.Formatter):
-    """Lines as sd-daemon(3) wants them: priority first, on every line of a message."""
+    """Formatter after sd-daemon(3): the priority precedes every line of a message."""
 
     def format(self, record: logging.LogRecord) -> str:
         prefix = f"<{PRIORITY.get(record.levelno, 6)}>"

@@ -1,11 +1,12 @@
-"""The loop's thread before all other programs, and its memory never paged out, where the service's unit allows it.
+"""Real-time scheduling of the event loop's thread and memory locking, where the service unit permits both.
 
-The right is the switch: a unit with ``LimitRTPRIO=`` and ``LimitMEMLOCK=infinity`` says that this computer is there for
-the robot. A person who tries the program in a terminal, even as root, gets neither.
+The resource limits are the switch. A unit with ``LimitRTPRIO=`` and ``LimitMEMLOCK=infinity`` dedicates the computer to
+the robot. A run in a terminal, even as root, gets neither.
 
-The other threads come right behind the loop, ahead of ordinary programs. They must: while one of them holds the
-interpreter and another program has its processor, the loop waits for that program, whatever its own priority is. With
-both cores busy cycles began up to 130 ms late for this; they are at work for a few hundredths of the time only.
+The other threads run just below the loop's priority and above ordinary programs. This is necessary: one of them may
+hold the interpreter lock while another program has its processor. The loop then waits for that program, at any priority
+of its own. With both cores busy, cycles started up to 130 ms late because of this. These threads compute for a few
+hundredths of the time only.
 """
 
 from __future__ import annotations
@@ -18,33 +19,33 @@ from pathlib import Path
 from typing import Final
 
 PRIORITY: Final = 40
-"""Of SCHED_FIFO: above ordinary threaded interrupts' users, below the interrupts themselves (50)."""
+"""Priority in SCHED_FIFO: above ordinary users of threaded interrupts, below the interrupts themselves (50)."""
 BEHIND: Final = 1
-"""Of SCHED_RR: that of the other threads, the lowest there is above all ordinary programs."""
+"""Priority in SCHED_RR of the other threads: the lowest real-time priority, above all ordinary programs."""
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
-"""Flags of mlockall(2). On fault: only what is touched is kept; stacks and arenas are mostly never."""
+"""Flags of mlockall(2). ONFAULT locks only pages that are touched; most of the stacks and arenas never are."""
 
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Parameters of mallopt(3)."""
 
 LARGE, SLACK = 1 << 20, 1 << 20
-"""Blocks of so many bytes are mapped each by itself; so much may be free at the end of the heap."""
+"""Size in bytes above which each block gets a mapping of its own; bytes that may stay free at the end of the heap."""
 RESERVE, OBJECTS = 16 << 20, 3 << 20
-"""Bytes of the heap, and of the interpreter's own, that are there before the first cycle: what a map fills up."""
+"""Bytes of the C heap and of the interpreter's heap that are reserved before the first cycle; the map fills them."""
 ARENA, SMALL = 1 << 20, 400
-"""The interpreter takes and gives back its memory by so many bytes; an object that lies in it."""
+"""Bytes of one allocation unit of the interpreter; size in bytes of an object inside it."""
 _stakes: list[bytes] = []
-"""An object in each part of the interpreter's reserve: what is empty is given back."""
+"""One object in each allocation unit of the interpreter's reserve: an empty unit would be returned."""
 
 
 def give_back() -> None:
-    """Have memory that a job has needed returned to the system when it is freed, where the C library is glibc.
+    """Return freed memory of jobs to the system, where the C library is glibc.
 
-    By itself, glibc takes the first large block that is freed for a sign that more of that size will come, and carves
-    those out of the heap from then on, where one small block behind them keeps them: a robot that was lost for a second
-    kept 30 MB for good. And it gives each thread a heap of its own, so that what one of them frees, others cannot use:
-    what loading the kernels leaves free would hold a map for hours.
+    By default, when the first large block is freed, glibc expects more of that size and takes them from the heap from
+    then on. One small block behind them then keeps them allocated: one second of relocalisation kept 30 MB for good.
+    glibc also gives each thread a heap of its own, so that memory freed by one thread is not available to others.
+    Memory left free by loading the kernels could then hold a map for hours.
     """
     libc = ctypes.CDLL(None)
     if hasattr(libc, "mallopt"):
@@ -54,10 +55,10 @@ def give_back() -> None:
 
 
 def reserve() -> None:
-    """Have the next memory that is needed at hand, where the C library is glibc: a map that grows meets no page fault.
+    """Reserve memory in advance, where the C library is glibc, so that a growing map causes no page fault.
 
-    It is taken, written to and freed again: objects of the interpreter's, and blocks smaller than those that are mapped
-    each by itself. Both heaps keep it from then on.
+    The memory is allocated, written to and freed again: interpreter objects, and blocks below the mapping threshold.
+    Both heaps keep it from then on.
     """
     objects = [bytes(SMALL) for _ in range(OBJECTS // SMALL)]
     _stakes.extend(objects[:: ARENA // SMALL // 2])
@@ -69,16 +70,16 @@ def reserve() -> None:
     libc.free.argtypes = [ctypes.c_void_p]
     piece = LARGE // 2
     for block in [libc.malloc(piece) for _ in range(RESERVE // piece)]:
-        if block:  # none: there is no memory left, and nothing to be had at hand
+        if block:  # null: no memory is left to reserve
             ctypes.memset(block, 0, piece)
             libc.free(block)
 
 
 def claim() -> tuple[str, ...]:
-    """Take what the limits allow, for the calling thread and its process; what was taken, or why not, a phrase each.
+    """Apply real-time scheduling and memory locking as far as the limits permit; return one phrase on each.
 
-    Threads made later do not inherit it (SCHED_RESET_ON_FORK): only the loop is in a hurry. They get their place from
-    :func:`line_up`. The memory of :func:`reserve` is taken whatever the limits say.
+    It applies to the calling thread and its process. Later threads do not inherit it (SCHED_RESET_ON_FORK), because
+    only the loop is urgent; :func:`line_up` sets their priority. :func:`reserve` runs whatever the limits are.
     """
     if not _stakes:
         reserve()
@@ -88,9 +89,9 @@ def claim() -> tuple[str, ...]:
 
 
 def line_up() -> int:
-    """Put threads made since the last call behind the calling one, where that is ahead of other programs; how many.
+    """Set the priority of new threads below the calling thread's, if that one is real-time; return how many changed.
 
-    Call it now and then: it costs a few microseconds a thread.
+    Call it periodically: it costs a few microseconds a thread.
     """
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return 0
@@ -98,14 +99,14 @@ def line_up() -> int:
     try:
         tasks = [int(path.name) for path in Path("/proc/self/task").iterdir()]
     except OSError:
-        return 0  # no file descriptor is left: the next call will do
+        return 0  # no file descriptor is left: the next call will succeed
     for task in tasks:
         try:
             if task != ours and os.sched_getscheduler(task) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER:
                 os.sched_setscheduler(task, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(BEHIND))
                 moved += 1
         except OSError:
-            continue  # it has ended, or the limit allows no more
+            continue  # the thread has ended, or the limit permits no more
     return moved
 
 
@@ -122,7 +123,9 @@ def _schedule(most: int) -> str:
 
 def _lock(most: int) -> str:
     if most != resource.RLIM_INFINITY:
-        return "memory not locked (the unit sets no LimitMEMLOCK=infinity)"  # a bound would make later calls fail
+        return (
+            "memory not locked (the unit sets no LimitMEMLOCK=infinity)"  # under a finite limit later calls would fail
+        )
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT):
         return f"memory not locked ({os.strerror(ctypes.get_errno())})"

@@ -1,4 +1,4 @@
-"""The service manager's notification protocol (sd_notify(3)): datagrams to ``$NOTIFY_SOCKET``, nothing without it."""
+"""Service manager notification (sd_notify(3)): datagrams to ``$NOTIFY_SOCKET``; without it nothing is sent."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import socket
 
 
 def managed() -> bool:
-    """Whether a service manager has started us, and wants to be told."""
+    """Whether a service manager started this process and expects notifications."""
     return os.environ.get("NOTIFY_SOCKET", "").startswith(("/", "@"))
 
 
 def notify(*words: str) -> None:
-    """Tell the service manager, e.g. ``READY=1``; silently nothing when there is none or it has gone."""
+    """Send a notification, e.g. ``READY=1``, to the service manager; without one, do nothing."""
     if not managed():
         return
     address = os.environ["NOTIFY_SOCKET"]
@@ -20,4 +20,4 @@ def notify(*words: str) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sock:
             sock.sendto("\n".join(words).encode(), address.replace("@", "\0", 1))
     except OSError:
-        return  # it restarts, its queue is full, or there is no file descriptor left: the next word will do
+        return  # the manager restarts, its queue is full, or no file descriptor is left: the next notification will do

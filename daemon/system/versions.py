@@ -1,4 +1,4 @@
-"""Which software this is: for recordings and results, so that a figure can be traced to what made it."""
+"""Software versions and build digest, stored in recordings and results to make every figure traceable."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from typing import Any, Final
 ROOT: Final = Path(__file__).resolve().parents[2]
 _PARTS: Final = ("lumiloop", "numpy", "numba", "llvmlite", "scipy")
 _ROOMS: Final = ("daemon", "estimator", "hal")
-"""Packages whose sources decide what a pose becomes."""
+"""Packages whose sources affect a pose."""
 _LONGEST: Final = 40
-"""Letters of a version that somebody else has written."""
+"""Longest version text that is accepted from a recording."""
 
 
 def versions() -> dict[str, str]:
-    """Name to version of ourselves and of everything that takes part in the arithmetic.
+    """Versions by name: this project and every library that takes part in the computation.
 
-    ``build`` is the same wherever the same sources run; ``commit`` is there where they are those of a git tree.
+    ``build`` is equal wherever the same sources run. ``commit`` is present where the sources are a git tree.
     """
     found = {"python": platform.python_version(), "machine": platform.machine(), "build": build()}
     if commit := _commit(ROOT):
@@ -30,7 +30,7 @@ def versions() -> dict[str, str]:
 
 
 def release(part: str = "lumiloop") -> str:
-    """Version of a package as it is installed."""
+    """Version of a package as installed."""
     try:
         return version(part)
     except PackageNotFoundError:
@@ -39,7 +39,7 @@ def release(part: str = "lumiloop") -> str:
 
 @lru_cache(maxsize=1)
 def build() -> str:
-    """Digest of our sources as they were when first asked for it: a version alone does not tell two commits apart."""
+    """Digest of the sources at the first call; a version number alone does not distinguish two commits."""
     digest = hashlib.sha256()
     for path in sorted(path for room in _ROOMS for path in (ROOT / room).rglob("*.py")):
         digest.update(f"{path.relative_to(ROOT)}\0".encode())
@@ -48,9 +48,9 @@ def build() -> str:
 
 
 def made_elsewhere(header: Mapping[str, Any]) -> str:
-    """What a recording was made with where that is not what runs now, as a sentence.
+    """Sentence that states how the software of a recording differs from the present software.
 
-    Empty where it is the same, or where the ``header`` does not say; another commit of the same sources is the same.
+    Empty if both are equal, or if the ``header`` contains no versions. Another commit of the same sources is equal.
     """
     told, ours = header.get("versions"), versions()
     if not isinstance(told, dict):
@@ -69,7 +69,7 @@ def _readable(told: object) -> str:
 
 
 def _commit(root: Path) -> str:
-    """The commit that a git tree, or a worktree of one, stands at; empty where it is none."""
+    """Commit of a git tree or worktree; empty where the folder is neither."""
     git = root / ".git"
     try:
         if git.is_file():

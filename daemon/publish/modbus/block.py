@@ -1,8 +1,8 @@
-"""A block of input registers of its own, beside the first one: read in one request, it is one snapshot, whole.
+"""Modbus register block beside the first one: layout, encoding and decoding of one whole snapshot.
 
     Modbus    magic u16, version u16 | seq u32, points, big-endian, high word first | seq_end u32
 
-Under the same version a point never moves and never changes its meaning.
+One request reads the whole block. Under the same version a point never moves and never changes its meaning.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _SEQ: Final = Point(
 
 
 class Block(Layout):
-    """Where a block lies, what is in it, and its bytes.
+    """Address, points and encoding of a block.
 
     Attributes:
-        name: of what it is, for messages. address: of its first register. magic, version: its first two registers.
-        body: address of the first point, the snapshot's number. registers: how many in all.
+        name: of its content, for messages. address: of its first register. magic, version: its first two registers.
+        body: address of the first point, the snapshot's number. registers: number of registers.
     """
 
     def __init__(self, name: str, address: int, tag: str, version: int, points: Sequence[Point]) -> None:

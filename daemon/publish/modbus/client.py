@@ -1,4 +1,4 @@
-"""Reads the published block of a running daemon over Modbus UDP. Standard library only."""
+"""Modbus UDP client that reads the published blocks of a running daemon. Standard library only."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Reading = dict[str, Value]
 
 
 class NoAnswer(Exception):
-    """The daemon cannot be read; the text says why and what to do."""
+    """The daemon cannot be read; the text states the reason and the remedy."""
 
 
 class Reader:
@@ -31,11 +31,11 @@ class Reader:
 
     Args:
         host: name or address.
-        port: of it.
-        name: of the daemon that is meant, on this computer; None: whichever answers.
+        port: of the Modbus server.
+        name: of the intended daemon on this computer; None: any daemon.
 
     Raises:
-        NoAnswer: the host's name is not known.
+        NoAnswer: the host's name cannot be resolved.
     """
 
     def __init__(self, host: str, port: int, name: str | None = None) -> None:
@@ -59,10 +59,10 @@ class Reader:
         self._sock.close()
 
     def whose(self) -> Whose:
-        """Who answers.
+        """Process that owns the port.
 
         Raises:
-            NoAnswer: another daemon than the one that is meant, and that one runs, too.
+            NoAnswer: it is another daemon than the intended one, which runs too.
         """
         if self._name is None:
             return Whose(0, "", 0)
@@ -78,7 +78,7 @@ class Reader:
         """The latest snapshot.
 
         Raises:
-            NoAnswer: nothing there, not a lumiloop, another version.
+            NoAnswer: no reply, not a lumiloop, another version.
         """
         for _ in range(_TRIES):
             try:
@@ -101,7 +101,7 @@ class Reader:
         )
 
     def _block(self, block: Block) -> Reading:
-        """A block beside the first one; nothing where the daemon is of a version without it."""
+        """Read a block beside the first one; empty where the daemon's version does not have it."""
         for _ in range(_TRIES):
             with contextlib.suppress(OSError):
                 answer = self._ask(block.address, block.registers)
@@ -120,7 +120,7 @@ class Reader:
         while time.monotonic() < deadline:
             answer = self._sock.recv(512)
             if answer[:2] == self._transaction.to_bytes(2, "big"):
-                return answer  # an answer to an earlier, repeated request is skipped
+                return answer  # a reply to an earlier, repeated request is skipped
         raise TimeoutError
 
     def _reading(self, answer: bytes) -> Reading:

@@ -1,4 +1,4 @@
-"""What the Modbus server has seen, and which clients it may answer."""
+"""Counters of the Modbus server, and the type of its allow-list."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Allowed = Callable[[str], bool]
 
 
 def everyone(_: str) -> bool:
-    """No host is turned away."""
+    """Allow-list that accepts every host."""
     return True
 
 
 @dataclass(slots=True)
 class Counts:
-    """What the server has seen; of whom it does not serve the log has a line a minute."""
+    """Counters of the Modbus server; a client that is not served is logged once a minute."""
 
     requests: int = 0
     malformed: int = 0
@@ -36,5 +36,5 @@ class Counts:
     lines: dict[str, Sparing] = field(default_factory=dict)
 
     def tell(self, peer: str, what: str) -> None:
-        """Say of a client what becomes of it."""
+        """Log what happened to a client, at a limited rate."""
         self.lines.setdefault(what, Sparing(log, 1, 60.0)).say(time.monotonic(), logging.INFO, f"Modbus: {peer} {what}")

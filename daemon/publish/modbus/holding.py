@@ -1,8 +1,8 @@
-"""Holding registers that clients may write: a command block and an odometry input. Pure: no sockets, no clock.
+"""Modbus holding registers that clients may write: a command block and an odometry input. Pure: no sockets, no clock.
 
-Both follow one discipline, so that a write that is lost, repeated or torn does no harm: parameters may be written in
-any order, and only a *new number* in the block's first register makes them count. A command is answered by the same
-number in `acknowledge`. An odometry reading must come in one request, because half of one would be a wrong pose.
+Both follow one rule, so that a lost, repeated or torn write does no harm. Parameters may be written in any order, and
+take effect only with a *new number* in the block's first register. The same number in `acknowledge` confirms a command.
+An odometry reading must come in one request, because half of one would be a wrong pose.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ MAX_READING_AGE_S: Final = 1.0
 
 
 class CommandCode(IntEnum):
-    """What may be asked. Numbers are part of the contract: never renumber."""
+    """Commands of clients. Numbers are part of the contract: never renumber."""
 
-    SET_POSE = 1  # the robot is at (x, y, yaw) in the map frame
-    RESET = 2  # forget map and pose, start anew
-    SAVE_MAP = 3  # write the map to the disk; done when it is there and has been read back
-    RELOCALISE = 4  # the robot was carried off: look for it everywhere in the map
-    PAUSE = 5  # the map is not touched and the laser does not move the pose, until RESUME
-    RESUME = 6  # the end of a pause
-    DUMP_RECORDER = 7  # write what the flight recorder holds; done when it is on the disk
-    SWITCH_MAP = 8  # go on in the stored map `map_id`; the one in use is saved first
+    SET_POSE = 1  # set the pose to (x, y, yaw) in the map frame
+    RESET = 2  # discard map and pose, and restart
+    SAVE_MAP = 3  # write the map to the disk; done after it has been read back
+    RELOCALISE = 4  # the robot was kidnapped: search the whole map for its pose
+    PAUSE = 5  # until RESUME, the map does not change and the lidar does not update the pose
+    RESUME = 6  # end a pause
+    DUMP_RECORDER = 7  # write the flight recorder's content; done when it is on the disk
+    SWITCH_MAP = 8  # switch to the stored map `map_id`; the one in use is saved first
 
 
 class Outcome(IntEnum):
-    """What became of a command. Numbers are part of the contract: never renumber."""
+    """Outcome of a command. Numbers are part of the contract: never renumber."""
 
     NONE = 0  # no command yet
-    RUNNING = 1  # taken, not finished
+    RUNNING = 1  # accepted, not finished
     DONE = 2
     REFUSED = 3  # not possible now
     UNKNOWN = 4  # no such command
@@ -45,7 +45,7 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A command as a client asked for it: its number, what, and its parameters: a pose (m, m, rad), a stored map."""
+    """A client's command: number, code, and parameters: a pose (m, m, rad), a stored map."""
 
     number: int
     code: CommandCode
@@ -55,7 +55,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class WrittenOdometry:
-    """A reading as a client wrote it: cumulative pose (m, m, rad), how old it was, whether the count begins anew."""
+    """A client's odometry reading: cumulative pose (m, m, rad), its age, whether the count restarts."""
 
     x: float
     y: float
@@ -92,7 +92,7 @@ COMMAND: Final = Layout(
               "request.", can_be_unknown=False, access="RW"),
     )
 )  # fmt: skip
-_ANSWER_AT: Final = 8  # acknowledge, result: told by us
+_ANSWER_AT: Final = 8  # acknowledge, result: written by the daemon
 _WRITABLE: Final = ((0, _ANSWER_AT), (_ANSWER_AT + 2, COMMAND.words))
 
 LOOP: Final = Layout(
@@ -117,12 +117,12 @@ class Refused(Exception):
 
 
 class Holding:
-    """The writable registers and what they set off.
+    """The writable registers and their actions.
 
     Args:
-        on_command: called with each new known command; its end is told by :meth:`acknowledge`.
+        on_command: called with each new valid command; :meth:`acknowledge` reports its end.
         on_odometry: called with each new reading.
-        on_loop_seen: called with the count of loops that a client has seen.
+        on_loop_seen: called with the number of loop closures that a client has acknowledged.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class Holding:
         self._reading = -1  # number of the last reading; none yet
 
     def read(self, address: int, count: int) -> bytes:
-        """Registers as bytes. Raises Refused where there are none."""
+        """Registers as bytes. Raises Refused for registers that do not exist."""
         blocks = ((COMMAND_ADDRESS, self._command), (ODOMETRY_ADDRESS, self._odometry), (LOOP_ADDRESS, self._loop))
         for start, memory in blocks:
             if start <= address and 2 * (address - start + count) <= len(memory):
@@ -149,7 +149,7 @@ class Holding:
         raise Refused
 
     def write(self, address: int, data: bytes) -> None:
-        """Write registers (big-endian bytes) and act on a new number. Raises Refused where it is not allowed."""
+        """Write registers (big-endian bytes) and act on a new number. Raises Refused where writing is not permitted."""
         at = address - COMMAND_ADDRESS
         if any(begin <= at and at + len(data) // 2 <= end for begin, end in _WRITABLE):
             self._command[2 * at : 2 * at + len(data)] = data
@@ -164,7 +164,7 @@ class Holding:
             raise Refused
 
     def acknowledge(self, number: int, outcome: Outcome) -> None:
-        """Tell the client that a request is finished; ignored when a newer one has replaced it."""
+        """Report the outcome of a request to the client; ignored when a newer request has replaced it."""
         if number == self._number:
             self._put_result(number, outcome)
 

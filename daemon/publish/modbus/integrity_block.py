@@ -1,4 +1,4 @@
-"""What is published of the trust in a pose: a register block of its own, and the end of the pose datagram.
+"""Modbus block and pose datagram tail for integrity: protection level, alert, solutions behind it.
 
     Modbus    magic u16, version u16 | seq u32, POINTS, big-endian, high word first | seq_end u32     at 340
     datagram  POINTS, little-endian, behind the tail of :mod:`daemon.publish.modbus.lights_block`

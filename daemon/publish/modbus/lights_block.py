@@ -1,10 +1,10 @@
-"""The published picture of the lights: a register block of its own, and the end of the pose datagram.
+"""Modbus block and pose datagram tail for light: the light solution and the links in view.
 
     Modbus    magic u16, version u16 | seq u32, HEAD, 16 ROWs, big-endian, high word first | seq_end u32     at 200
     datagram  TAIL, little-endian, behind the body of :mod:`daemon.publish.modbus.registers`
 
 The contract is that of the other tables: under the same version a point never moves and never changes its meaning.
-The block is only put together when somebody reads it; most clients never do.
+The block is encoded only when a client reads it; most clients never do.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ _USES: Final = ", ".join(f"{use.value} {use.name}" for use in LinkUse)
 
 
 def _light(name: str) -> Getter:
-    """A value of the picture; None where there is no photodiode."""
+    """Getter of a value of the light solution; None where there is no photodiode."""
     value = attrgetter(name)
     return lambda snapshot: None if snapshot.light is None else value(snapshot.light)
 
 
 def _count(name: str) -> Getter:
-    """A counter of the picture; 0 where there is no photodiode."""
+    """Getter of a counter of the light solution; 0 where there is no photodiode."""
     value = attrgetter(name)
     return lambda snapshot: 0 if snapshot.light is None else value(snapshot.light)
 
 
 def _part(name: str, index: int) -> Getter:
-    """Component of a triple that may be missing as a whole."""
+    """Getter of one component of a triple that may be missing as a whole."""
     triple = attrgetter(name)
 
     def get(snapshot: Snapshot) -> Value:
@@ -71,7 +71,7 @@ _SIGMA: Final = "One standard deviation, rounded up; the largest value means thi
 
 
 def _estimate() -> tuple[Point, ...]:
-    """The position from lights alone: in the block, and in the datagram in the same order."""
+    """Points of the light solution's position, in the same order in the block and in the datagram."""
     return (
         Point("light_fix", "fix from lights alone", U16, _light("fix"), f"{_FIXES}. Not known: no photodiode."),
         Point("light_used", "links used", U16, _light("used"), "Lamps that the fix rests on."),

@@ -1,4 +1,4 @@
-"""What is published of the daemon's parts: every fault that is present, what had to be restarted, for how long it runs.
+"""Modbus block for health: every present fault, restarts by component, hanging threads, uptime.
 
     Modbus    magic u16, version u16 | seq u32, POINTS, big-endian, high word first | seq_end u32     at 400
 
@@ -16,7 +16,7 @@ from daemon.publish.modbus.points import U16, U32, Point, Rule, Value
 from daemon.snapshot import NO_CONDITION, Condition, Part, Snapshot, Thread
 
 FAULTS: Final = 12
-"""Faults that are named; more are only counted."""
+"""Largest number of faults that the block lists; more are only counted."""
 
 PARTS: Final = {
     Part.LIDAR: "the lidar's driver: streams begun anew, and ports",
@@ -31,7 +31,7 @@ PARTS: Final = {
     Part.MAP: "the keeper of the map",
     Part.OTHER: "anything else",
 }
-"""Meaning of the parts, by number. Part of the contract: never renumber."""
+"""Meaning of the components, by number. Part of the contract: never renumber."""
 THREADS: Final = {
     Thread.SOLVER: "a computation that the pose waits for; after two minutes the watchdog ends the daemon",
     Thread.SEARCH: "a search in the background; after two minutes the watchdog ends the daemon",

@@ -1,7 +1,7 @@
-"""What one published value is: its wire type, its scale, its "not known" value, and how it is packed.
+"""Published point: wire type, scale, "not known" value, and encoding of one value.
 
-Two rules hold for every point. A measurement *saturates* at the largest value its type can carry and never wraps; a
-counter *wraps* modulo its width, because a reader takes differences of it and a saturated counter would fall silent.
+Two rules apply to every point. A measurement *saturates* at the largest value of its type and never wraps. A counter
+*wraps* modulo its width, because a reader takes differences of it and a saturated counter would stop.
 "Not known" is the value SunSpec calls "not implemented": all ones for unsigned types, the smallest number for signed.
 """
 
@@ -18,7 +18,7 @@ from typing import Final
 from daemon.snapshot import Snapshot
 
 Value = int | float | None
-"""A decoded point: SI units where the table gives a unit, None where the wire says "not known"."""
+"""A decoded point: SI units where the table gives a unit, None for the "not known" value."""
 
 FLOAT32_MAX: Final = (2.0 - 2.0**-23) * 2.0**127
 
@@ -34,7 +34,7 @@ class Wire:
 
     @property
     def words(self) -> int:
-        """16-bit registers taken."""
+        """Number of 16-bit registers."""
         return self.bits // 16
 
     @property
@@ -57,7 +57,7 @@ U64: Final = Wire("uint64", "Q", 64, signed=False)
 
 
 class Rule(Enum):
-    """What happens to a value that the type cannot carry."""
+    """Treatment of a value that the type cannot represent."""
 
     SATURATE = "saturates"
     WRAP = "wraps"
@@ -65,11 +65,11 @@ class Rule(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One value of the published block, in the manner of a SunSpec point.
+    """One value of the published block, after the model of a SunSpec point.
 
     Attributes:
-        name: key in decoded readings and in the documents. label: a few words for a person.
-        wire: integer type. value: takes it from a snapshot, in `unit`; None or NaN: not known.
+        name: key in decoded readings and in the documents. label: short description for display.
+        wire: integer type. value: getter from a snapshot, in `unit`; None or NaN: not known.
         per_unit: raw counts per `unit` (10 000 per m: 0.1 mm each). unit: SI, empty for numbers without one.
         rule: see :class:`Rule`. ceil: round up, for uncertainties, which must never be published too small.
         can_be_unknown: whether the not-known value has its meaning here. access: R or RW. text: for the documents.
@@ -92,7 +92,7 @@ class Point:
         return self.encoder()(value)
 
     def encoder(self) -> Callable[[Value], int]:
-        """:meth:`encode` with all that is the same for every value worked out beforehand."""
+        """:meth:`encode` with everything precomputed that is the same for every value."""
         missing, modulus = self.wire.not_known if self.can_be_unknown else 0, 1 << self.wire.bits
         (low, high), scale, to_int = self.wire.span, self.per_unit, math.ceil if self.ceil else round
 
@@ -115,7 +115,7 @@ class Point:
 
 
 def from_client(_: Snapshot) -> Value:
-    """Value of a point that clients write: a snapshot has none."""
+    """Getter of a point that clients write: a snapshot contains no value for it."""
     return None
 
 
@@ -129,14 +129,14 @@ class FloatPoint:
     value: Callable[[Snapshot], Value]
 
     def encode(self, value: Value) -> float:
-        """The value as a float32 can carry it; infinities and overflow saturate."""
+        """The value as float32; infinities and overflow saturate."""
         if value is None or value != value:
             return math.nan
         return max(-FLOAT32_MAX, min(FLOAT32_MAX, float(value)))
 
 
 class Layout:
-    """Points one after another without gaps: packs and unpacks them in either byte order."""
+    """Consecutive points without gaps, encoded and decoded in either byte order."""
 
     def __init__(self, points: Sequence[Point]) -> None:
         self.points: Final = tuple(points)
@@ -149,7 +149,7 @@ class Layout:
         self._latest: tuple[Snapshot | None, tuple[int, ...]] = (None, ())
 
     def raw(self, snapshot: Snapshot) -> tuple[int, ...]:
-        """Raw integers of a snapshot, in order; those of the latest are kept, for several publishers ask for them."""
+        """Raw integers of a snapshot, in order; cached for the latest one, because several publishers use it."""
         if self._latest[0] is not snapshot:
             self._latest = snapshot, tuple([encode(value(snapshot)) for encode, value in self._plan])
         return self._latest[1]

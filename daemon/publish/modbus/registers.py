@@ -1,7 +1,7 @@
-"""The one table behind everything that is published: Modbus block, UDP datagram, float mirror, and their documents.
+"""Table of all published points: source of the Modbus block, UDP datagram, float mirror, and their documents.
 
-The points of :data:`BODY` are the same, in the same order and scale, in both forms; only the byte order and the frame
-around them differ::
+The points of :data:`BODY` are the same, in the same order and scale, in both forms; only the byte order and the header
+and end around them differ::
 
     Modbus    magic u16, version u16 | BODY, big-endian, high word first  | seq_end u32        64 registers at 0
     datagram  "LUMI",    version u16, length u16 | BODY, two tails, little-endian | CRC-32     172 bytes
@@ -11,8 +11,8 @@ The tails are TAIL of :mod:`daemon.publish.modbus.lights_block` and of :mod:`dae
 each has a block of registers of its own.
 
 Every 32- and 64-bit point is naturally aligned in the datagram. The contract: a point never moves and never changes its
-meaning under the same version number (a frozen copy of the layout is compared in the tests). A datagram may grow at its
-end under the same version; readers go by `length`.
+meaning under the same version number (the tests compare a fixed copy of the layout). A datagram may grow at its end
+under the same version; readers use `length`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Getter = Callable[[Snapshot], Value]
 
 
 def _part(name: str, index: int) -> Getter:
-    """Component of a triple that may be missing as a whole."""
+    """Getter of one component of a triple that may be missing as a whole."""
     triple = attrgetter(name)
 
     def get(snapshot: Snapshot) -> Value:
@@ -48,7 +48,7 @@ def _part(name: str, index: int) -> Getter:
 
 
 def _yaw(name: str) -> Getter:
-    """Third component of a pose, wrapped to [-pi, pi]."""
+    """Getter of the third component of a pose, wrapped to [-pi, pi]."""
     part = _part(name, 2)
 
     def get(snapshot: Snapshot) -> Value:
@@ -59,7 +59,7 @@ def _yaw(name: str) -> Getter:
 
 
 def _sigma(index: int) -> Getter:
-    """Square root of a variance; a negative variance is not known."""
+    """Getter of the square root of a variance; a negative variance is not known."""
 
     def get(snapshot: Snapshot) -> Value:
         covariance = snapshot.covariance
@@ -69,7 +69,7 @@ def _sigma(index: int) -> Getter:
 
 
 def _rho(cross: int, first: int, second: int) -> Getter:
-    """Correlation coefficient; 0 where a variance is 0, not known where it is not finite."""
+    """Getter of a correlation coefficient; 0 where a variance is 0, not known where it is not finite."""
 
     def get(snapshot: Snapshot) -> Value:
         covariance = snapshot.covariance
@@ -228,7 +228,7 @@ BODY_OFFSET: Final = _DATAGRAM_HEAD.size
 TAIL_OFFSET: Final = BODY_OFFSET + BODY.little.size
 TRUST_OFFSET: Final = TAIL_OFFSET + lights_block.TAIL.little.size
 SMALLEST_DATAGRAM: Final = TAIL_OFFSET + _CRC.size
-"""Without a tail, as the first programs of this version sent it."""
+"""Size without a tail, in bytes, as the first programs of this version sent it."""
 DATAGRAM_SIZE: Final = TRUST_OFFSET + integrity_block.TAIL.little.size + _CRC.size
 _TAILS: Final = ((TAIL_OFFSET, lights_block.TAIL), (TRUST_OFFSET, integrity_block.TAIL))
 
@@ -254,10 +254,10 @@ def encode_datagram(snapshot: Snapshot) -> bytes:
 
 
 def decode_block(block: bytes) -> dict[str, Value]:
-    """Values by name from the 64 registers.
+    """Decode the 64 registers to values by name.
 
     Raises:
-        ValueError: not this block, a version this decoder does not know, or torn (seq differs at its ends).
+        ValueError: not this block, a version this decoder does not support, or torn (seq differs at its ends).
     """
     if len(block) != 2 * BLOCK_WORDS:
         raise ValueError(f"the block has {BLOCK_WORDS} registers, got {len(block) / 2:g}")
@@ -274,7 +274,7 @@ def decode_block(block: bytes) -> dict[str, Value]:
 
 
 def decode_mirror(mirror: bytes) -> dict[str, Value]:
-    """Values by name from the float32 mirror, with `seq`.
+    """Decode the float32 mirror to values by name, with `seq`.
 
     Raises:
         ValueError: wrong size or torn.
@@ -289,9 +289,9 @@ def decode_mirror(mirror: bytes) -> dict[str, Value]:
 
 
 def decode_datagram(data: bytes) -> dict[str, Value]:
-    """Values by name from a pose datagram; bytes that a later minor revision put behind it are skipped.
+    """Decode a pose datagram to values by name; bytes that a later minor revision appended are skipped.
 
-    Values that an earlier program did not send are left out.
+    Values that an earlier program did not send are absent.
 
     Raises:
         ValueError: not a pose datagram, another version, damaged.

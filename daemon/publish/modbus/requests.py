@@ -1,10 +1,11 @@
-"""Modbus requests and their answers: one application data unit in, one out. Pure: no sockets, no clock.
+"""Modbus requests and their replies: one application data unit in, one out. Pure: no sockets, no clock.
 
-Frames and function bodies are packed and unpacked by pymodbus's framer and message classes. Reading the published block
-has a short way of its own, because that is nearly every request there ever is; a test holds it to the same bytes.
+pymodbus's framer and message classes encode and decode application data units and function bodies. Reading the
+published block has a fast path, because nearly every request is one; a test compares its bytes with those of the
+general path.
 
-Answered: 3 and 4 (read holding, read input registers: both show the published blocks, 3 also the writable ones),
-6 and 16 (write, where writing is allowed). Any unit identifier is answered and echoed: there is one device behind it.
+Functions: 3 and 4 (read holding, read input registers: both return the published blocks, 3 also the writable ones), 6
+and 16 (write, where writing is allowed). Any unit identifier is accepted and returned: there is one device behind it.
 (MODBUS Application Protocol V1.1b3; MODBUS Messaging on TCP/IP Implementation Guide V1.0b.)
 """
 
@@ -51,13 +52,14 @@ _FIXED_BODY: Final = 5  # function, address, count or value
 
 Make = Callable[[], bytes]
 BLOCKS: Final = (lights_block.BLOCK, integrity_block.BLOCK, timing_block.BLOCK, parts_block.BLOCK)
-"""The blocks of their own, by address."""
+"""The blocks beside the first one, by address."""
 _BESIDE: Final = ((MIRROR_ADDRESS, MIRROR_WORDS), *((block.address, block.registers) for block in BLOCKS))
-"""First address and size of the blocks beside the first one, in the order in which they are shown."""
+"""First address and size of the blocks beside the first one, in the order in which :meth:`Responder.show` takes them.
+"""
 
 
 def frame_size(data: bytes | bytearray) -> int:
-    """Size of the frame that begins with these bytes, as its header says; 0: too short to tell; -1: not Modbus."""
+    """Size of the application data unit that starts here, from its header; 0: incomplete header; -1: not Modbus."""
     if len(data) < HEADER_SIZE + 1:
         return 0
     length = data[4] << 8 | data[5]
@@ -67,7 +69,7 @@ def frame_size(data: bytes | bytearray) -> int:
 
 
 class Responder:
-    """Answers requests out of the latest published blocks.
+    """Replies to requests from the latest published blocks.
 
     Args:
         holding: writable registers, or None where writing is not allowed.
@@ -82,16 +84,16 @@ class Responder:
         self._told = ""
 
     def show(self, block: bytes, *beside: Make) -> None:
-        """Put all blocks in place at once: no answer ever mixes two snapshots.
+        """Replace all blocks at once: no reply ever mixes two snapshots.
 
-        ``beside`` make the blocks of the same snapshot that few clients read (float mirror, lights, integrity); they
-        are called when those are read.
+        ``beside`` encode the blocks of the same snapshot that few clients read (float mirror, lights, integrity). They
+        are called when a client reads those.
         """
         self._block = block
         self._make, self._made = beside, {}
 
     def answer(self, frame: bytes) -> bytes:
-        """The answer to one whole frame, which :func:`frame_size` has found good."""
+        """Reply to one complete application data unit that :func:`frame_size` has accepted."""
         if len(frame) == _READ.size:
             transaction, _, _, unit, function, address, count = _READ.unpack(frame)
             if function in (READ_INPUT, READ_HOLDING) and 0 < count <= MAX_READ:
@@ -102,14 +104,14 @@ class Responder:
         return self.answer_any(frame)
 
     def answer_any(self, frame: bytes) -> bytes:
-        """The same without the short way."""
+        """The same reply without the fast path."""
         _, unit, transaction, body = self._framer.decode(frame)
         message = self._respond(body)
         message.dev_id, message.transaction_id = unit, transaction
         return self._framer.buildFrame(message)
 
     def answer_body(self, body: bytes) -> bytes:
-        """The answer to a function's body alone, as serial lines carry it."""
+        """Reply to a function's body alone, as on serial lines."""
         message = self._respond(body)
         return bytes([message.function_code]) + message.encode()
 
@@ -126,13 +128,13 @@ class Responder:
             return ExceptionResponse(function, ExcCodes.ILLEGAL_ADDRESS)
         except (ValueError, IndexError, struct.error, ModbusException):
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
-        except Exception as error:  # noqa: BLE001  whatever it is, the client is told, and the log
+        except Exception as error:  # noqa: BLE001  any failure is reported to the client and logged
             self._failed(error)
             return ExceptionResponse(function, ExcCodes.DEVICE_FAILURE)
         return ExceptionResponse(function, ExcCodes.ILLEGAL_FUNCTION)
 
     def _failed(self, error: Exception) -> None:
-        """A defect of ours is told in full; once, as clients ask again and again."""
+        """Log a defect with its traceback; once, because clients repeat their requests."""
         if repr(error) != self._told:
             self._told = repr(error)
             log.error("a Modbus request cannot be answered; its client is told exception 4", exc_info=error)

@@ -1,11 +1,11 @@
-"""Modbus RTU on a serial line: the same tables as on UDP and TCP, and one client, the line's master.
+"""Modbus RTU server on a serial line: the same tables as on UDP and TCP, for one client, the line's master.
 
-* An answer goes out 3.5 characters after its request at the earliest, as the standard asks: a half-duplex master needs
-  that time to let the line go.
-* What the line sends back of our own answers (adapters with echo) is no request.
-* A request for which this computer had no time until its master has given up is neither carried out nor answered: the
-  answer would collide with the master's next request.
-* Nothing waits: an answer that the line does not take is dropped, and after three in a row the line is opened anew.
+* A reply starts 3.5 characters after its request at the earliest, as the standard requires: a half-duplex master needs
+that time to release the line.
+* An echo of our own replies (adapters with echo) is no request.
+* A request that this computer could not process before its master gave up is neither carried out nor replied to: the
+reply would collide with the master's next request.
+* Nothing waits: a reply that the line does not accept is dropped, and after three in a row the line is opened again.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from hal.errors import DeviceMissing, DeviceRefused, HalError
 from hal.port.port import Port
 
 SILENCE_S: Final = 0.05
-"""Without a byte for so long, a request that has begun does not end any more; USB adapters pause for up to 16 ms."""
+"""Time in s without a byte after which an incomplete request is discarded; USB adapters pause for up to 16 ms."""
 ECHO_S: Final = 0.005
-"""Our own answer may come back this long after its last bit; no master asks again that soon."""
+"""Time in s after the last bit of a reply in which its echo may arrive; no master sends a request that soon."""
 PATIENCE_S: Final = 0.3
-"""A request older than this is given up by its master, or soon will be; masters wait for half a second or more."""
+"""Age in s from which a request counts as given up by its master; masters wait for half a second or more."""
 TURN_S: Final = 0.05
-"""The loop tells this often that it has time for the line."""
+"""Period in s of the timer that shows that the loop has time for the line."""
 STRAY: Final = 2
 """Bytes that a line driver may add where the direction changes; more of them are the master's next request."""
 UNSENT: Final = 3
-"""Answers in a row that a line does not take, until it is opened anew: its adapter is wedged."""
+"""Consecutive replies that the line does not accept, after which it is opened again: its adapter is blocked."""
 _FAST: Final = 19200
 _FAST_GAP_S: Final = 0.00175
 _CHARACTER: Final = 11.0  # bits
 
 Answer = Callable[[bytes], bytes]
-"""Body of a request to the body of its answer."""
+"""Function from the body of a request to the body of its reply."""
 
 
 class LineOpener(Protocol):
@@ -48,7 +48,7 @@ class LineOpener(Protocol):
 
 
 async def open_line(device: str, baud: int, *, style: str) -> Port:
-    """A real line; pyserial is imported only here. Raises `DeviceMissing`, `DeviceRefused`."""
+    """Open a real line; pyserial is imported only here. Raises `DeviceMissing`, `DeviceRefused`."""
     from hal.port.serial_port import NOT_SERIAL, open_serial_port
 
     try:
@@ -67,11 +67,11 @@ class RtuServer:
     """Serves one line.
 
     Args:
-        line: which, and our unit. answer: makes the answer's body.
-        opener: opens it.
+        line: path, format and our unit. answer: makes the reply's body.
+        opener: opens the line.
 
     Attributes:
-        requests, unsent: answered, and answers that the line did not take. late: given up, for lack of time.
+        requests, unsent: requests served, and replies that the line did not accept. late: given up, for lack of time.
     """
 
     def __init__(self, line: RtuLine, answer: Answer, opener: LineOpener = open_line) -> None:
@@ -82,7 +82,7 @@ class RtuServer:
         self._opener = opener
         self._port: Port | None = None
         self._lost: asyncio.Future[HalError] | None = None
-        self._untaken = 0  # answers in a row
+        self._untaken = 0  # replies in a row
         self._heard = 0.0
         self._sent = b""
         self._echo_until = 0.0
@@ -94,7 +94,7 @@ class RtuServer:
         """Serve until cancelled.
 
         Raises:
-            HalError: the line cannot be opened, has gone, or takes no answers.
+            HalError: the line cannot be opened, is lost, or accepts no replies.
         """
         self._lost, self._untaken = asyncio.get_running_loop().create_future(), 0
         self._port = await self._opener(self._line.path, self._line.baud, style=self._line.format)
@@ -115,7 +115,7 @@ class RtuServer:
             self._lost.set_result(error)
 
     def _turns(self) -> None:
-        """Whatever comes after this was not there before it."""
+        """Periodically record that the loop is running: bytes received after this time were not there before."""
         loop = asyncio.get_running_loop()
         self._free = loop.time()
         self._turn = loop.call_later(TURN_S, self._turns)
@@ -129,8 +129,8 @@ class RtuServer:
         late = t_rx - self._free > PATIENCE_S
         for unit, body in self.frames.feed(data):
             if t_rx <= self._echo_until and framed(unit, body) == self._sent:
-                continue  # the answer to a write of one register is its request again
-            if late and unit != BROADCAST:  # what is for all is not answered, nor repeated
+                continue  # the reply to a write of one register equals its request
+            if late and unit != BROADCAST:  # a broadcast is neither replied to nor repeated
                 self.late += 1
                 continue
             self.requests += 1
@@ -145,7 +145,7 @@ class RtuServer:
             self.late += 1
 
     def _send_soon(self, frame: bytes, asked: float) -> None:
-        """Once the master has let the line go; it waits for no more than one answer, and for that not for ever."""
+        """Send a reply after the gap that the master needs; a newer reply replaces one that waits."""
         self._give_up()
         gap = _FAST_GAP_S if self._line.baud > _FAST else 3.5 * _CHARACTER / self._line.baud
         self._going = asyncio.get_running_loop().call_later(gap, self._send, frame, asked)

@@ -1,8 +1,8 @@
-"""Modbus RTU requests out of a stream of bytes, and answers into it. Pure: no line, no clock.
+"""Modbus RTU framing: extracts requests from a stream of bytes and encodes replies. Pure: no line, no clock.
 
-A request has no mark at its begin, and the silence at its end does not come through a USB adapter. So a request is
-what begins with our unit (or 0, which is for all), has the length that its function says, and ends with the right
-CRC-16. What is not that is passed over byte by byte: noise, other devices' requests, and their answers.
+A request has no start mark, and a USB adapter does not pass on the silence at its end. A request therefore starts with
+our unit (or 0, a broadcast), has the length that its function defines, and ends with the right CRC-16. Everything else
+is skipped byte by byte: noise, other devices' requests, and their replies.
 (MODBUS over Serial Line Specification and Implementation Guide V1.02, 2.5.1.)
 """
 
@@ -22,17 +22,17 @@ _FIXED: Final = {
 }  # fmt: skip
 """Bytes of a request by function, unit and CRC included (MODBUS Application Protocol V1.1b3, chapter 6)."""
 _COUNTED: Final = {15: 6, 16: 6, 20: 2, 21: 2, 23: 10}
-"""Where the function's request holds its count of bytes; that many follow, and the CRC."""
+"""Offset of the byte count in a request, by function; that many bytes follow, and the CRC."""
 
 
 def framed(unit: int, body: bytes) -> bytes:
-    """A frame around a function's body."""
+    """RTU message with unit and CRC around a function's body."""
     frame = bytes([unit]) + body
     return frame + FramerRTU.compute_CRC(frame).to_bytes(_CRC, "big")
 
 
 def _size(data: bytearray, at: int) -> int:
-    """Bytes of the request that may begin here; 0: too few are there to tell, -1: none begins here."""
+    """Size of the request that may start here; 0: too few bytes to decide, -1: none starts here."""
     if at + 1 >= len(data):
         return 0
     function = data[at + 1]
@@ -48,7 +48,7 @@ def _size(data: bytearray, at: int) -> int:
 
 
 class RtuFrames:
-    """Collects the bytes of a line and finds the requests that are for us.
+    """Collects the bytes of a line and extracts the requests for this unit.
 
     Args:
         unit: our address on the line.
@@ -61,17 +61,17 @@ class RtuFrames:
         self.skipped = 0
         self._unit = unit
         self._data = bytearray()
-        self._open: list[int] = []  # where requests may begin that are not whole yet
-        self._next = 0  # from here on nothing has been looked at
+        self._open: list[int] = []  # possible starts of incomplete requests
+        self._next = 0  # first position that has not been examined
 
     def forget(self) -> None:
-        """Drop what has been collected: the line was silent, so no request is still on its way."""
+        """Discard the collected bytes: the line was silent, so no request is still on its way."""
         self._skip(len(self._data))
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
-        """The requests that are whole with these bytes: unit as addressed, and the function's body.
+        """Requests that these bytes complete: unit as addressed, and the function's body.
 
-        Each place is judged once, when all of the request is there that may begin at it.
+        Each position is examined once, when the whole request that may start at it has arrived.
         """
         self._data += data
         found: list[tuple[int, bytes]] = []
@@ -85,7 +85,7 @@ class RtuFrames:
         return found
 
     def _first(self) -> tuple[int, int] | None:
-        """Place and size of the first request that is whole; what is not looked at again is let go of."""
+        """Position and size of the first complete request; positions that need no second look are discarded."""
         waiting, self._open = self._open, []
         while waiting or self._next < len(self._data):
             if waiting:
@@ -101,7 +101,7 @@ class RtuFrames:
         return None
 
     def _skip(self, count: int) -> None:
-        """Let go of what can be no part of a request any more."""
+        """Discard bytes that cannot be part of a request any more."""
         self.skipped += count
         del self._data[:count]
         self._open = [at - count for at in self._open if at >= count]

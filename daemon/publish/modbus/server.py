@@ -1,12 +1,12 @@
-"""Modbus server on UDP and TCP: transports of our own around :class:`daemon.publish.modbus.requests.Responder`.
+"""Modbus server on UDP and TCP: own transports around :class:`daemon.publish.modbus.requests.Responder`.
 
-* UDP: one datagram is one request. Nothing is kept between datagrams, so one client cannot disturb another.
-* TCP: every request in a segment is answered, in order. A connection that sends what is not Modbus is closed.
-* A turn of the event loop serves at most 64 requests (8 on each of two UDP sockets, one of each of at most 32
-  connections, 16 of those that wait with more), so that no client, and no crowd of them, can delay the cycle.
-* All of them together have half of the loop's time (:mod:`hal.net.fair_share`), however many ask how fast.
-* Nothing waits for a client: an answer that the kernel does not take at once is dropped (UDP), and a connection whose
-  answers are not read is left unserved, then closed (TCP).
+* UDP: one datagram is one request. Nothing is stored between datagrams, so one client cannot disturb another.
+* TCP: every request in a segment is served, in order. A connection that sends other data than Modbus is closed.
+* An iteration of the event loop serves at most 64 requests, so that no number of clients can delay the cycle. These are
+8 on each of two UDP sockets, one on each of at most 32 connections, and 16 from waiting connections.
+* All of them together have half of the loop's time (:mod:`hal.net.fair_share`), at any number and rate of requests.
+* Nothing waits for a client. A reply that the kernel does not accept at once is dropped (UDP). A connection whose
+replies are not read is not served any more, then closed (TCP).
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ _RECEIVE_BUFFER: Final = 256 * 1024
 
 
 def _ignore(_: object) -> None:
-    """Nobody wants to know."""
+    """Default callback that ignores its argument."""
 
 
 class ModbusPublisher:
-    """Shows the latest snapshot to Modbus clients on UDP and TCP.
+    """Serves the latest snapshot to Modbus clients on UDP and TCP.
 
     Args:
         clock: time of arrival of written odometry.
-        write: whether commands and odometry may be written. allowed: whether a host may be answered.
-        on_command: takes each command; tell its end by :meth:`acknowledge`.
-        on_odometry: takes each written odometry reading. on_loop_seen: how many loops a client has seen.
+        write: whether commands and odometry may be written. allowed: whether a host may be served.
+        on_command: receives each command; report its end by :meth:`acknowledge`.
+        on_odometry: receives each written odometry reading. on_loop_seen: number of acknowledged loop closures.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class ModbusPublisher:
         self._holding = Holding(on_command, self._take_odometry, on_loop_seen) if write else None
         self._responder = Responder(self._holding)
         self._share = Share()
-        self._age_s = 0.0  # of the datagram that is being answered
+        self._age_s = 0.0  # of the datagram in processing
         self._udp: list[UdpEndpoint] = []
         self._tcp: TcpEndpoint | None = None
         self.counts = Counts()
@@ -72,7 +72,7 @@ class ModbusPublisher:
         self.publish(Snapshot(seq=0, t_mono=0.0, t_sent=0.0, t_utc=0.0, state=State.STARTING, reason=0))
 
     def answer(self, body: bytes) -> bytes:
-        """The answer to a function's body, for transports of another kind."""
+        """Reply to a function's body, for transports of another kind."""
         return self._responder.answer_body(body)
 
     async def start(self, bind: str, port: int) -> None:
@@ -80,7 +80,7 @@ class ModbusPublisher:
 
         Args:
             bind: name or address of this computer; empty: all of them.
-            port: 0: any free one, told by :attr:`port`.
+            port: 0: any free one, available as :attr:`port`.
 
         Raises:
             DeviceRefused: port in use, or not permitted. DeviceMissing: no such address here.
@@ -109,12 +109,12 @@ class ModbusPublisher:
             undo.pop_all()
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Show a snapshot from now on; never waits."""
+        """Serve this snapshot from now on; never waits."""
         encoders = (registers.encode_mirror, *(block.encode for block in BLOCKS))
         self._responder.show(registers.encode_block(snapshot), *[partial(encode, snapshot) for encode in encoders])
 
     def acknowledge(self, number: int, outcome: Outcome) -> None:
-        """Tell the client what became of its command."""
+        """Report the outcome of a command to the client."""
         if self._holding is not None:
             self._holding.acknowledge(number, outcome)
 

@@ -1,4 +1,4 @@
-"""Modbus over TCP: connections, their share of each turn of the event loop, and when they are closed."""
+"""Modbus over TCP: connections, their share of each event loop iteration, and when they are closed."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from hal.net.fair_share import Share
 log = logging.getLogger(__name__)
 
 TCP_WAITING_PER_TURN: Final = 16
-IDLE_S: Final = 60.0  # without a whole request
+IDLE_S: Final = 60.0  # without a complete request
 PARTIAL_S: Final = 5.0  # a request that is not completed
-STUCK_S: Final = 10.0  # answers that are not read
-EVICT_S: Final = 5.0  # a full house drops the longest idle of those idle for longer
+STUCK_S: Final = 10.0  # replies that are not read
+EVICT_S: Final = 5.0  # at the largest number of connections, the longest idle one beyond this is closed
 _SWEEP_S: Final = 1.0
 _WRITE_HIGH: Final = 16 * 1024
 _READ_HIGH: Final = 16 * 1024
@@ -76,24 +76,24 @@ class Connection(asyncio.Protocol):
                 self._server.wait(self)
 
     def eof_received(self) -> bool:
-        """asyncio: the client sends no more; it gets the answers it is owed, then the connection closes."""
+        """asyncio: the client sends no more; it receives the outstanding replies, then the connection closes."""
         self._ended = True
         if not self.waiting:
             self._server.wait(self)
         return True
 
     def pause_writing(self) -> None:
-        """asyncio: answers pile up unread."""
+        """asyncio: replies accumulate unread."""
         self._blocked_since = self._loop.time()
 
     def resume_writing(self) -> None:
-        """asyncio: answers are read again."""
+        """asyncio: replies are read again."""
         self._blocked_since = None
         if not self.waiting:
             self._server.wait(self)
 
     def serve(self, most: int) -> bool:
-        """Answer up to `most` requests; returns whether more can be answered at once."""
+        """Serve up to `most` requests; return whether more can be served at once."""
         transport, size = self._transport, 0
         if transport is None or self._blocked_since is not None:
             return False
@@ -117,7 +117,7 @@ class Connection(asyncio.Protocol):
         return more
 
     def overdue(self, now: float) -> bool:
-        """Whether this client has used up our patience."""
+        """Whether this client has exceeded one of the time limits."""
         if self._blocked_since is not None:
             return now - self._blocked_since > STUCK_S
         return now - self.last_request > IDLE_S or (bool(self._buffer) and now - self._heard > PARTIAL_S)
@@ -129,7 +129,7 @@ class Connection(asyncio.Protocol):
 
 
 class TcpEndpoint:
-    """Serves listening sockets and shares each turn fairly among their connections."""
+    """Serves listening sockets and distributes each loop iteration fairly among their connections."""
 
     def __init__(
         self, responder: Responder, counts: Counts, allowed: Allowed = everyone, share: Share | None = None
@@ -163,7 +163,7 @@ class TcpEndpoint:
             await server.wait_closed()
 
     def admit(self, connection: Connection) -> None:
-        """Take a new connection; a full house first drops its longest idle one, and else refuses the new one."""
+        """Accept a connection. At the largest number, the longest idle one is closed, or else the new one refused."""
         if len(self._connections) >= MAX_CONNECTIONS:
             oldest = min(self._connections, key=lambda c: c.last_request)
             if self._loop.time() - oldest.last_request <= EVICT_S:
@@ -178,19 +178,19 @@ class TcpEndpoint:
         self.counts.connections = len(self._connections)
 
     def forget(self, connection: Connection) -> None:
-        """A connection is gone."""
+        """Remove a closed connection."""
         self._connections.pop(connection, None)
         self.counts.connections = len(self._connections)
 
     def wait(self, connection: Connection) -> None:
-        """Queue a connection that has more requests than its turn allows."""
+        """Queue a connection that has more requests than one iteration permits."""
         connection.waiting = True
         self._waiting.append(connection)
         if len(self._waiting) == 1:
             self._loop.call_soon(self._serve_waiting)
 
     def _serve_waiting(self) -> None:
-        """Round robin, each its part of the turn's share."""
+        """Serve waiting connections in round-robin order, each with its part of the iteration's share."""
         if not self.share.begin():
             self._again = self.share.later(self._serve_waiting)
             return
@@ -206,7 +206,7 @@ class TcpEndpoint:
         self.share.end()
 
     def _served(self, connection: Connection, most: int) -> bool:
-        """As :meth:`Connection.serve`; one that cannot be served is closed, and the others still have their turn."""
+        """As :meth:`Connection.serve`; a connection that fails is closed, and the others are still served."""
         try:
             return connection.serve(most)
         except Exception:

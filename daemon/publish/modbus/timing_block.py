@@ -1,9 +1,9 @@
-"""What is published of the cycle itself: what it leaves out for lack of time, how long its stages take, when it stood.
+"""Modbus block for cycle timing: degradation level, stage times, stalls.
 
     Modbus    magic u16, version u16 | seq u32, POINTS, big-endian, high word first | seq_end u32     at 354
 
 The contract is that of the other tables: under the same version a point never moves and never changes its meaning.
-Quantiles are those of the last half minute to minute, the largest value too.
+Quantiles are those of the last half minute to minute, and so is the maximum.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ RUNGS: Final = (
     "no map work either",
     "the laser is left out too: light and odometry carry the pose",
 )
-"""Meaning of the rungs, by number. Part of the contract: never renumber."""
+"""Meaning of the degradation levels, by number. Part of the contract: never renumber."""
 
 Getter = Callable[[Snapshot], Value]
 _STAGES: Final = tuple(Stage)[:-1]
@@ -49,7 +49,7 @@ def _count(name: str) -> Getter:
 
 
 def _spread(row: int, place: int) -> Getter:
-    """Quantile ``place`` (0 median, 1 p99, 2 largest) of a row, s."""
+    """Getter of quantile ``place`` (0 median, 1 p99, 2 maximum) of a row, s."""
 
     def get(snapshot: Snapshot) -> Value:
         pulse = snapshot.pulse

@@ -1,4 +1,4 @@
-"""Modbus over UDP: one datagram is one request, and nothing is kept between datagrams."""
+"""Modbus over UDP: one datagram is one request, and nothing is stored between datagrams."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class UdpEndpoint:
         share: Share | None = None,
         on_age: Callable[[float], None] | None = None,
     ) -> None:
-        """``on_age``: told before each request how long ago the kernel received it, and 0 after the last."""
+        """``on_age``: receives before each request its age since the kernel received it (s), and 0 after the last."""
         self._sock = sock
         self._on_age = on_age
-        self._space = 0  # for what the kernel tells about a datagram
+        self._space = 0  # size of the kernel's ancillary data of a datagram
         if on_age is not None:
             enable_rx_timestamps(sock)
             self._space += STAMP_SPACE
@@ -64,7 +64,7 @@ class UdpEndpoint:
                         self._on_age(kernel_age(told))
                 else:
                     frame, peer = self._sock.recvfrom(MAX_FRAME + 1)
-            except OSError:  # nothing more, or the network's complaint about an earlier answer
+            except OSError:  # no more data, or a network error caused by an earlier reply
                 return
             if not self._allowed(peer[0]):
                 continue

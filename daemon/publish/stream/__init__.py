@@ -1,1 +1,1 @@
-"""The local stream: a unix socket with msgpack frames for processes beside the daemon; server, client, messages."""
+"""Local stream: a unix socket with msgpack messages for processes beside the daemon; server, client, messages."""

@@ -3,7 +3,7 @@
 async for frame in Stream(path, ("pose", "scan")).frames():
     match frame:
         case Hello(): ...       # connected, or connected again
-        case Lost(): ...        # the daemon has gone; frames go on when it is back
+        case Lost(): ...        # the daemon has gone; messages continue when it is back
         case Pose(): ...
 """
 
@@ -25,23 +25,23 @@ from daemon.publish.stream.server import TOPICS
 FIRST_RETRY_S: Final = 0.2
 LAST_RETRY_S: Final = 2.0
 SILENT_S: Final = 10.0
-"""Without a greeting for so long: the daemon stands, or the path leads to another program."""
+"""Time in s without a greeting after which the daemon counts as stalled, or the path as another program's."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """There is no connection; ``text`` says why. Told once, not at each try."""
+    """Loss of the connection; ``text`` is the reason. It comes once, not at each attempt."""
 
     text: str
 
 
 class Stream:
-    """What a daemon tells, for as long as somebody asks.
+    """Messages of a daemon, for as long as they are iterated.
 
     Args:
-        path: of the socket; or the name of a daemon, whose socket is looked for at each try.
-        topics: that are wanted.
-        patient: whether to go on trying after a loss, and when nobody is there at first.
+        path: of the socket; or the name of a daemon, whose socket is located at each attempt.
+        topics: to subscribe to.
+        patient: whether to retry after a loss, and when there is no daemon at first.
 
     Raises:
         ValueError: no such topic.
@@ -54,14 +54,14 @@ class Stream:
 
     @property
     def path(self) -> Path:
-        """Of the socket, as far as is known now."""
+        """Path of the socket, as far as it is available now."""
         return stream_path(self._of) if isinstance(self._of, str) else self._of
 
     async def frames(self) -> AsyncGenerator[Frame | Lost, None]:
-        """Every frame, from the greeting on; ends after :class:`Lost` where it is not patient. To be closed.
+        """All messages, from the greeting on; ends after :class:`Lost` if not patient. The caller closes it.
 
         Raises:
-            NotTheStream: what comes cannot be read, or our request was refused; trying again would not help.
+            NotTheStream: the data cannot be read, or our request was refused; another attempt would not help.
         """
         retry, told = FIRST_RETRY_S, False
         while True:
@@ -96,11 +96,11 @@ async def _connected(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, as
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         yield reader, writer
     finally:
-        writer.transport.abort()  # nothing of ours is worth waiting for
+        writer.transport.abort()  # no unsent data is worth waiting for
 
 
 async def _frames(reader: asyncio.StreamReader) -> AsyncGenerator[Frame, None]:
-    """Frames until the daemon closes; what this version does not know is left out."""
+    """Messages until the daemon closes; topics that this version does not define are skipped."""
     greeted = False
     while (body := await _body(reader, None if greeted else SILENT_S)) is not None:
         frame = messages.decode(body)
@@ -114,7 +114,7 @@ async def _frames(reader: asyncio.StreamReader) -> AsyncGenerator[Frame, None]:
 
 
 async def _body(reader: asyncio.StreamReader, patience_s: float | None) -> bytes | None:
-    """The next frame without its length; None: closed, also in the middle of one."""
+    """Body of the next message without its length; None: closed, also in the middle of one."""
     try:
         async with asyncio.timeout(patience_s):
             length = int.from_bytes(await reader.readexactly(4), "little")
@@ -132,7 +132,7 @@ def _nobody(error: OSError) -> bool:
 
 
 def _others(path: Path) -> str:
-    """Daemons that may be meant: who forgets `--config` asks for the one of the default name."""
+    """List of daemons that may be meant: without `--config`, the client uses the default name."""
     names = sorted({name for folder in {path.parent, SERVICE} for name in daemons_in(folder)} - {path.stem})
     runs = "runs" if len(names) == 1 else "run"
     return f"; {', '.join(names)} {runs} here: `--set name={names[0]}`, or `--config`" if names else ""

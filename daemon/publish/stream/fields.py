@@ -1,7 +1,7 @@
-"""What the data of each topic of the local stream hold: names and types, part of the contract (docs/stream.md).
+"""Field names and types of each topic of the local stream, part of the contract (docs/stream.md).
 
-Types are those of msgpack; ``s`` is a float, ``f32[]`` bytes of little-endian float32. Under one `stream.SCHEMA` none
-of these goes and none changes; more may come.
+Types are those of msgpack; ``s`` is a float, ``f32[]`` bytes of little-endian float32. Under one `stream.SCHEMA` no
+field is removed or changed; fields may be added.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Fields = Mapping[str, str]
 
 _SAID: Final = {"state_name": "str", "meaning": "str", "remedy": "str"}
 RECORDS: Final[Mapping[str, type]] = {"pose": Snapshot, "lights": LightPicture}
-"""Topics that tell a record of `daemon.snapshot` with all its fields."""
+"""Topics that contain a record of `daemon.snapshot` with all its fields."""
 FIELDS: Final[Mapping[str, Fields]] = {
     "hello": {"schema": "int", "name": "str", "pid": "int", "topics": "map of str"},
     "error": {"text": "str"},
@@ -44,4 +44,4 @@ FIELDS: Final[Mapping[str, Fields]] = {
         "tiles": "list of [column: int, row: int, cells: deflated int8[side * side]]",
     },
 }  # fmt: skip
-"""By topic; `pose` and `lights` besides what :data:`RECORDS` says."""
+"""Fields by topic; `pose` and `lights` in addition to :data:`RECORDS`."""

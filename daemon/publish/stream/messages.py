@@ -1,7 +1,7 @@
 """Typed messages of the local stream: bytes in, records out, no I/O (docs/stream.md is the contract).
 
-Fields that this version does not know are skipped; states and faults stay numbers, of which a newer
-daemon may have more.
+Fields that this version does not define are skipped. States and faults stay numbers, because a newer daemon may have
+more of them.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from daemon.publish.stream.server import SCHEMA, framed
 
 Triple = tuple[float, float, float]
 LONGEST: Final = 8 << 20
-"""Bytes of a frame; what is longer is no frame of a lumiloop."""
+"""Largest size of a message in bytes; a longer one is not from a lumiloop."""
 
 
 class NotTheStream(Exception):
-    """What comes is nothing that this version can read; the text says what, and what to do."""
+    """The data cannot be read by this version; the text states the defect and the remedy."""
 
 
 class Hello(msgspec.Struct, frozen=True, kw_only=True):
-    """The first frame: version of the stream, name of the robot, process of the daemon."""
+    """First message: version of the stream, name of the robot, process of the daemon."""
 
     schema: int
     name: str
@@ -34,13 +34,13 @@ class Hello(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Refused(msgspec.Struct, frozen=True, kw_only=True):
-    """The last frame: what was wrong with our request."""
+    """Last message: the defect of our request."""
 
     text: str
 
 
 class Trust(msgspec.Struct, frozen=True, kw_only=True):
-    """How far the pose can be trusted; see `daemon.snapshot.Trust`."""
+    """Integrity of the pose; see `daemon.snapshot.Trust`."""
 
     horizontal_m: float | None = None
     yaw_rad: float | None = None
@@ -54,7 +54,7 @@ class Trust(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CycleTiming(msgspec.Struct, frozen=True, kw_only=True):
-    """How the cycle is doing; see `daemon.snapshot.CycleTiming`. Spreads: median, 99 of 100, largest, us."""
+    """Cycle timing; see `daemon.snapshot.CycleTiming`. Spreads: median, 99th percentile, maximum, us."""
 
     rung: int = 0
     thinned: int = 0
@@ -69,7 +69,7 @@ class CycleTiming(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Condition(msgspec.Struct, frozen=True, kw_only=True):
-    """How the parts are; see `daemon.snapshot.Condition`."""
+    """Health of the components; see `daemon.snapshot.Condition`."""
 
     uptime_s: int = 0
     faults: tuple[int, ...] = ()
@@ -114,7 +114,7 @@ class Pose(msgspec.Struct, frozen=True, kw_only=True):
     condition: Condition | None = None
 
     def utc(self, t_mono: float) -> float:
-        """An instant of the daemon's clock as seconds since the Unix epoch."""
+        """Convert an instant of the daemon's clock to seconds since the Unix epoch."""
         return self.t_utc - self.t_sent + t_mono
 
 
@@ -129,7 +129,7 @@ class Link(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Lights(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``lights``: what lights alone say; see `daemon.snapshot.LightPicture`. Empty: no photodiode."""
+    """Topic ``lights``: the light solution; see `daemon.snapshot.LightPicture`. Empty: no photodiode."""
 
     fix: int = 0
     used: int = 0
@@ -144,9 +144,9 @@ class Lights(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Scan(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``scan``: one turn of the laser; bearings in rad from its front, counter-clockwise.
+    """Topic ``scan``: one scan of the lidar; bearings in rad from its front, counter-clockwise.
 
-    ``range_min``, ``range_max`` (m): what the device can measure; ``beam_dt``, ``period`` (s): of a beam, of a turn.
+    ``range_min``, ``range_max`` (m): measuring range of the device; ``beam_dt``, ``period`` (s): of a beam, of a scan.
     """
 
     seq: int
@@ -160,12 +160,12 @@ class Scan(msgspec.Struct, frozen=True, kw_only=True):
     period: float = 0.0
 
     def ranges_m(self) -> npt.NDArray[np.float32]:
-        """Distance of each beam; infinite: no echo from within reach; not a number: the device could not tell."""
+        """Distance of each beam; infinite: no echo within range; not a number: no valid measurement."""
         return np.frombuffer(self.ranges[: len(self.ranges) // 4 * 4], "<f4")
 
 
 class StateChange(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``state``."""
+    """Topic ``state``: a change of the published state."""
 
     t_mono: float
     state: int
@@ -175,7 +175,7 @@ class StateChange(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Loop(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``loop``: a loop closure; residual in m; where both keyframes lie in the map, None: not known any more."""
+    """Topic ``loop``: a loop closure; residual in m; poses of both keyframes in the map, None: not available."""
 
     t_mono: float
     counter: int
@@ -188,7 +188,7 @@ class Loop(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Fault(msgspec.Struct, frozen=True, kw_only=True):
-    """One fault that is present."""
+    """One present fault."""
 
     fault: int
     meaning: str = ""
@@ -196,14 +196,14 @@ class Fault(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Faults(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``faults``: all that are present, gravest first; no time in the first one."""
+    """Topic ``faults``: all present faults, gravest first; the first message has no time."""
 
     present: tuple[Fault, ...]
     t_mono: float | None = None
 
 
 class Statistics(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``statistics``: counters since the start; seconds unless said otherwise."""
+    """Topic ``statistics``: counters since the start; seconds unless stated otherwise."""
 
     t_mono: float
     uptime: float = 0.0
@@ -225,7 +225,7 @@ class Statistics(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Raw(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``raw``: what has passed between daemon and a device; docs/stream.md has the kinds."""
+    """Topic ``raw``: traffic between daemon and a device; docs/stream.md lists the kinds."""
 
     device: str
     kind: str
@@ -236,7 +236,7 @@ class Raw(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapTiles(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``map``: some tiles as they are now; ``more`` says that others follow at once."""
+    """Topic ``map``: some tiles with their present content; ``more``: others follow at once."""
 
     map_id: int
     resolution: float
@@ -247,7 +247,7 @@ class MapTiles(msgspec.Struct, frozen=True, kw_only=True):
     tiles: tuple[tuple[int, int, bytes], ...]
 
     def cells(self, packed: bytes) -> npt.NDArray[np.int8]:
-        """One tile's log-odds in units of ``unit``: (side, side), rows from below.
+        """Decode one tile's log-odds in units of ``unit``: (side, side), rows from below.
 
         Raises:
             NotTheStream: the bytes are no tile.
@@ -290,10 +290,10 @@ _data: Final = {topic: msgspec.msgpack.Decoder(kind).decode for topic, kind in T
 
 
 def decode(body: bytes) -> Frame | None:
-    """One frame without its length; None for a topic that this version does not know.
+    """Decode one message without its length; None for a topic that this version does not define.
 
     Raises:
-        NotTheStream: no frame, or one of another version.
+        NotTheStream: no message, or one of another version.
     """
     try:
         envelope = _envelope(body)
@@ -308,7 +308,7 @@ def decode(body: bytes) -> Frame | None:
 
 
 def read(topic: str, data: bytes) -> Data:
-    """What a topic tells, of its bytes alone.
+    """Decode the data of a topic.
 
     Raises:
         msgspec.DecodeError: they are not of that topic.
@@ -318,7 +318,7 @@ def read(topic: str, data: bytes) -> Data:
 
 
 def request(topics: tuple[str, ...]) -> bytes:
-    """The frame that says which topics are wanted."""
+    """Encode the message that subscribes to topics."""
     want: dict[str, Any] = {"want": list(topics)}
     return framed(want)
 

@@ -1,9 +1,9 @@
-"""The local stream: one unix socket from which every tap (web page, converter, logger) takes what it wants.
+"""Local stream server: one unix socket that serves every tap (web page, converter, logger) its subscribed topics.
 
-Frames are a little-endian length and that many bytes of msgpack, a map with at least ``topic``. A client says once what
-it wants. What is the latest of its kind replaces what a slow client has not taken yet (and is counted); what happens
-once (a loop, a change of state) is kept for it, up to a bound. Nothing here waits for a client, and without clients
-nothing is encoded: a tap that hangs costs the daemon a buffer.
+A message is a little-endian length and that many bytes of msgpack, a map with at least ``topic``. A client subscribes
+to topics. For a slow client, a newer message of a state-like topic replaces the pending one (and is counted); events (a
+loop, a change of state) are queued for it, up to a limit.
+No call waits for a client, and without clients nothing is encoded: a tap that hangs costs the daemon a buffer.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ __all__ = [
 Place = Callable[[int], tuple[float, float, float] | None]
 
 TILE_BYTES: Final = 32 << 10
-"""Of deflated tiles in one frame."""
+"""Largest size of the deflated tiles in one message, bytes."""
 SIDE: Final = 128
 UNIT: Final = 0.1
 """Cells of a tile, each way; log-odds of a cell's unit (`estimator.mapping.grid_patches`, which is not loaded here)."""
@@ -54,7 +54,9 @@ def scan_message(scan: RawScan) -> dict[str, object]:
     """A scan in SI units: bearings in rad from the lidar's front axis, counter-clockwise, evenly spaced."""
     geometry = scan.geometry
     bearing = geometry.bearings(scan.first_step, scan.stride, 2)
-    none = np.where(scan.code > geometry.dmax, np.inf, np.nan)  # no echo within reach, and what is no distance
+    none = np.where(
+        scan.code > geometry.dmax, np.inf, np.nan
+    )  # infinite: no echo within range; not a number: no valid distance
     ranges = np.where(scan.code == VALID, scan.ranges * geometry.range_unit_m, none).astype("<f4")
     return {
         "seq": scan.seq,
@@ -73,11 +75,11 @@ class StreamServer:
     """Serves the stream at a path in the file system.
 
     Attributes:
-        clients: that are connected. tiles: of the map; None: there are none. share: of the loop's time, for requests.
-        place: where a keyframe lies in the map, by ID; None: it is not known.
+        clients: connected ones. tiles: of the map; None: there are none. share: of the loop's time, for requests.
+        place: pose of a keyframe in the map, by ID; None: not available.
 
     Args:
-        path: of the socket; its folder is made. name: of the robot.
+        path: of the socket; its folder is created. name: of the robot.
         explain: meaning and remedy of a reason's number.
     """
 
@@ -114,7 +116,7 @@ class StreamServer:
             self.path.unlink(missing_ok=True)
 
     def _bind(self) -> socket.socket:
-        """The listening socket; what a dead program has left in its place is removed."""
+        """The listening socket; the socket file of a dead program is removed first."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.is_socket():
             if _alive(self.path):
@@ -123,7 +125,9 @@ class StreamServer:
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
             listening.bind(str(self.path))
-            self.path.chmod(0o666)  # it only tells; who may reach the folder may listen
+            self.path.chmod(
+                0o666
+            )  # every user may connect, because the stream is read-only; the folder's permissions limit access
             listening.listen(CLIENTS)
         except OSError:
             listening.close()
@@ -131,11 +135,11 @@ class StreamServer:
         return listening
 
     def hello(self) -> dict[str, object]:
-        """What a client is told first."""
+        """First message to a client."""
         return {"topic": "hello", "schema": SCHEMA, "name": self._name, "pid": os.getpid(), "topics": dict(TOPICS)}
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Tell a snapshot; a sink of the cycle."""
+        """Sink of the cycle: publish a snapshot to the subscribed clients."""
         before, self._latest = self._latest, snapshot
         if self.clients:
             told = self._told(snapshot)
@@ -147,44 +151,44 @@ class StreamServer:
                 self._tell("loop", lambda: _loop(snapshot, self.place))
 
     def _told(self, snapshot: Snapshot) -> dict[str, object]:
-        """The state in words."""
+        """Name, meaning and remedy of the state."""
         meaning, remedy = self._explain(snapshot.reason)
         return {"state_name": snapshot.state.name, "meaning": meaning, "remedy": remedy}
 
     def on_scan(self, scan: RawScan) -> None:
-        """Tell a scan."""
+        """Publish a scan."""
         self._tell("scan", lambda: scan_message(scan))
 
     def on_raw(self, device: str, kind: str, t_mono: float, data: bytes) -> None:
-        """Tell what has passed through a device's port; ``kind``: rx, tx, open, lost, baud."""
+        """Publish the traffic of a device's port; ``kind``: rx, tx, open, lost, baud."""
         self._tell("raw", lambda: {"device": device, "kind": kind, "t_mono": t_mono, "bytes": data})
 
     def on_samples(self, block: RawSamples) -> None:
-        """Tell a block of the photodiode's samples."""
+        """Publish a block of the photodiode's samples."""
         self._tell("raw", lambda: _samples(block))
 
     def on_faults(self, t_mono: float, faults: Iterable[tuple[int, str, str]]) -> None:
-        """Tell which faults are present (number, meaning, remedy), where they are others than before."""
+        """Publish the present faults (number, meaning, remedy) if they have changed."""
         told: list[dict[str, object]] = [{"fault": number, "meaning": m, "remedy": r} for number, m, r in faults]
         if told != self._faults:
             self._faults = told
             self._tell("faults", lambda: {"t_mono": t_mono, "present": told})
 
     def on_statistics(self, figures: Callable[[], Mapping[str, object]]) -> None:
-        """Tell statistics, if anybody wants them."""
+        """Publish statistics, if a client has subscribed to them."""
         self._tell("statistics", figures)
 
     def on_tiles(self) -> None:
-        """There are new tiles."""
+        """Send new tiles to the subscribed clients."""
         for client in [client for client in self.clients if "map" in client.wants]:
             self.show(client)
 
     def wanted(self, topic: str) -> bool:
-        """Whether anybody wants it."""
+        """Whether a client has subscribed to the topic."""
         return any(topic in client.wants for client in self.clients)
 
     def welcome(self, client: Client, fresh: frozenset[str]) -> None:
-        """A client wants these from now on: it is told how things stand."""
+        """Send the present state, faults and tiles to a client that has subscribed to these topics."""
         if "state" in fresh and (snapshot := self._latest) is not None:
             client.tell("state", encode(_state(snapshot, self._told(snapshot))))
         if "faults" in fresh:
@@ -194,7 +198,7 @@ class StreamServer:
             self.show(client)
 
     def show(self, client: Client) -> None:
-        """Send the tiles that a client has not seen yet, as far as it takes them."""
+        """Send the tiles that a client does not have yet, until its buffer is full."""
         tiles = [] if self.tiles is None or client.stuck else self.tiles.since(client.shown)
         while tiles and not client.stuck:
             size = count = 0
@@ -215,7 +219,7 @@ class StreamServer:
             client.tell("map", encode(message))
 
     def _tell(self, topic: str, data: Callable[[], Mapping[str, object]]) -> None:
-        """Encode once for all that want it."""
+        """Encode once and send to all subscribed clients."""
         wanting = [client for client in self.clients if topic in client.wants]
         if wanting:
             body = encode(data())
@@ -225,7 +229,7 @@ class StreamServer:
 
 def _alive(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as sock:
-        return sock.connect_ex(str(path)) in (0, errno.EAGAIN)  # again: it is there, and has many waiting
+        return sock.connect_ex(str(path)) in (0, errno.EAGAIN)  # EAGAIN: a program listens, and its queue is full
 
 
 def _fields(record: object) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Session of one client of the local stream: its topics, its queue, and when it is disconnected.
 
-What is the latest of its kind replaces what a slow one has not taken (and is counted); what happens once is kept for
-it, up to a bound.
+For a slow client, a newer message of a state-like topic replaces the pending one (and is counted); events are queued
+for it, up to a limit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hal.net.fair_share import Share
 log = logging.getLogger(__name__)
 
 SCHEMA: Final = 1
-"""Version of all that follows. A field never changes its meaning under the same number; readers skip unknown ones."""
+"""Version of all messages. A field never changes its meaning under the same number; readers skip unknown ones."""
 
 LATEST: Final = {
     "pose": "after each cycle: the whole snapshot, with the state in words",
@@ -28,65 +28,65 @@ LATEST: Final = {
     "scan": "each scan: ranges in m as little-endian float32, not a number where there is none",
     "statistics": "once a second: counters and times of cycle, devices and process",
 }
-"""Topics of which a slow client gets the latest only."""
+"""Topics of which a slow client receives the latest message only."""
 ONCE: Final = {
     "state": "at first and at a change: state and reason, with meaning and remedy",
     "loop": "a loop closed: counter, both keyframes, residual, reason",
     "faults": "at first and at a change: all that are present, with meaning and remedy",
 }
-"""Topics of which a client gets every one, up to :data:`KEPT`."""
+"""Topics of which a client receives every message, up to :data:`KEPT`."""
 RAW: Final = {"raw": "what passes between daemon and devices: bytes of the lidar's port, words of the photodiode"}
-"""As those, up to :data:`RAW_KEPT`."""
+"""Topics of which a client receives every message, up to :data:`RAW_KEPT`."""
 MAP: Final = {"map": "the map as tiles: at first all, then those that have changed"}
-"""A client gets every tile as it is when it comes to it."""
+"""Topic of which a client receives every tile, with the content at the time of sending."""
 TOPICS: Final[Mapping[str, str]] = {**LATEST, **ONCE, **RAW, **MAP}
 
 CLIENTS: Final = 32
 KEPT: Final = 64
 RAW_KEPT: Final = 256
 BUFFER_BYTES: Final = 256 << 10
-"""Bytes that may wait in this process for one client, and one frame."""
+"""Bytes that may wait in this process for one client, and one message."""
 LONGEST_REQUEST: Final = 4096
 REQUESTS_PER_TURN: Final = 4
-"""Of one client; each may want the whole map anew."""
+"""Largest number of requests of one client in one loop iteration; each may cause the whole map to be sent again."""
 STUCK_S: Final = 60.0
-"""A client that has taken nothing for so long is let go."""
+"""Time in s after which a client that reads nothing is disconnected."""
 
 encode: Final = msgspec.msgpack.Encoder().encode
 _request: Final = msgspec.msgpack.Decoder(dict[str, Any]).decode
 
 
 def framed(message: Mapping[str, object]) -> bytes:
-    """One frame."""
+    """Encode a message with its length."""
     body = encode(message)
     return len(body).to_bytes(4, "little") + body
 
 
 class Server(Protocol):
-    """What a tap is told, and by whom."""
+    """Server interface that a session uses."""
 
     clients: set[Client]
     share: Share
 
     def hello(self) -> dict[str, object]:
-        """What it is told first."""
+        """First message to a client."""
         ...
 
     def welcome(self, client: Client, fresh: frozenset[str]) -> None:
-        """It wants these from now on."""
+        """Send the present values of newly subscribed topics."""
         ...
 
     def show(self, client: Client) -> None:
-        """Send the tiles of the map that it has not seen."""
+        """Send the tiles of the map that the client does not have."""
         ...
 
 
 class Client(asyncio.Protocol):
-    """One tap.
+    """Session of one tap.
 
     Attributes:
-        wants: topics. replaced: frames that a newer one has replaced before it took them.
-        shown: the last tile of the map that it was sent.
+        wants: subscribed topics. replaced: messages that a newer one replaced before they were sent.
+        shown: the last tile of the map that was sent.
     """
 
     def __init__(self, server: Server) -> None:
@@ -104,11 +104,11 @@ class Client(asyncio.Protocol):
 
     @property
     def stuck(self) -> bool:
-        """Whether it does not take what it has asked for at the moment."""
+        """Whether the client does not read its messages at present."""
         return self._stuck is not None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Greet, or say that there are too many."""
+        """Send the greeting, or refuse the client if there are too many."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         transport.set_write_buffer_limits(high=BUFFER_BYTES)
@@ -119,20 +119,20 @@ class Client(asyncio.Protocol):
         transport.write(framed(self._server.hello()))
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget it."""
+        """Remove the client and stop its timers."""
         self._server.clients.discard(self)
         for timer in (self._stuck, self._again):
             if timer is not None:
                 timer.cancel()
 
     def data_received(self, data: bytes) -> None:
-        """Take requests."""
+        """Receive requests."""
         self._received += data
         if self._again is None:
             self._serve()
 
     def _serve(self) -> None:
-        """Take a few requests; the others wait for a turn of their own, and nothing more is read until then."""
+        """Serve a few requests; the others wait for a later iteration, and nothing more is read until then."""
         self._again, share, more = None, self._server.share, True
         if share.begin():
             try:
@@ -148,7 +148,7 @@ class Client(asyncio.Protocol):
             self._transport.resume_reading()
 
     def _serve_some(self) -> bool:
-        """Returns whether there are more."""
+        """Serve some requests; return whether there are more."""
         for _ in range(REQUESTS_PER_TURN):
             if not self._whole():
                 return False
@@ -159,7 +159,7 @@ class Client(asyncio.Protocol):
         return self._whole()
 
     def _whole(self) -> bool:
-        """Whether a whole request is there."""
+        """Whether a complete request has arrived."""
         if len(self._received) < 4:
             return False
         length = int.from_bytes(self._received[:4], "little")
@@ -169,11 +169,11 @@ class Client(asyncio.Protocol):
         return len(self._received) >= 4 + length
 
     def pause_writing(self) -> None:
-        """It does not take what it has asked for."""
+        """The client does not read its messages: start to queue them."""
         self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self._let_go)
 
     def resume_writing(self) -> None:
-        """It has caught up: it gets what has happened, and the latest of the rest."""
+        """The client has caught up: send the queued events, and the latest message of each other topic."""
         if self._stuck is not None:
             self._stuck.cancel()
             self._stuck = None
@@ -187,10 +187,10 @@ class Client(asyncio.Protocol):
             self._server.show(self)
 
     def tell(self, topic: str, body: bytes) -> None:
-        """Send, or keep for when it has caught up."""
+        """Send a message, or queue it until the client has caught up."""
         if self._stuck is None and self._transport is not None:
             head = encode({"topic": topic, "replaced": self.replaced})
-            # a map of three with the data's bytes as they are: encoded once, whoever wants it
+            # a map of three entries with the encoded data inserted: encoded once for all clients
             joined = b"\x83" + head[1:] + b"\xa4data" + body
             self._transport.write(len(joined).to_bytes(4, "little") + joined)
         elif topic in ONCE or topic in RAW:
@@ -202,7 +202,7 @@ class Client(asyncio.Protocol):
             self._latest[topic] = body
 
     def drop(self) -> None:
-        """Close without waiting for it."""
+        """Close without sending what is pending."""
         if self._transport is not None:
             self._transport.abort()
 

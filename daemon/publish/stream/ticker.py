@@ -1,4 +1,4 @@
-"""Messages of the local stream once a second: faults, statistics, tiles of the map."""
+"""Periodic messages of the local stream, once a second: faults, statistics, tiles of the map."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from daemon.publish.stream.server import StreamServer
 from daemon.runtime.cycle_facts import CycleFacts
 from daemon.runtime.vitals import process_age_s, resident_mb
 
-if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
+if TYPE_CHECKING:  # the warm-up loads the estimator in a thread
     from estimator import State
 
 BEAT_S: Final = 1.0
 
 
 class StreamBeat:
-    """One of the daemon's parts.
+    """Supervised component that sends the periodic messages.
 
     Args:
-        facts: about the cycle. state: of the estimator, None before it is loaded. faults: that are present.
+        facts: about the cycle. state: of the estimator, None before it is loaded. faults: present ones.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class StreamBeat:
         self.tiles = server.tiles = MapTiles(state, server.on_tiles)
 
     async def run(self) -> None:
-        """Tell until cancelled."""
+        """Send once a second until cancelled."""
         loop = asyncio.get_running_loop()
         try:
             while True:
@@ -48,7 +48,7 @@ class StreamBeat:
             self.tiles.close()
 
     def beat(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Tell once."""
+        """Send one set of periodic messages."""
         server, facts = self._server, self._facts()
         server.on_faults(facts.t_mono, in_words(self._faults()))
         server.on_statistics(lambda: figures(facts))
@@ -59,12 +59,12 @@ class StreamBeat:
 
 
 def in_words(faults: tuple[Fault, ...]) -> list[tuple[int, str, str]]:
-    """Number, meaning and remedy of each."""
+    """Number, meaning and remedy of each fault."""
     return [(int(fault), *FAULTS[fault]) for fault in faults]
 
 
 def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, float, float] | None:
-    """Where a keyframe lies in the map as corrected so far (m, m, rad); None where it is not kept any more."""
+    """Pose of a keyframe in the map with all corrections (m, m, rad); None where it is not stored any more."""
     now = state()
     frame = None if now is None else now.map.keyframes.get(keyframe)
     if frame is None:
@@ -74,7 +74,7 @@ def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, f
 
 
 def figures(facts: CycleFacts) -> dict[str, object]:
-    """Counters since the start, times in s unless said otherwise."""
+    """Counters since the start, times in s unless stated otherwise."""
     lidar, photodiode = facts.lidar, facts.photodiode
     return {
         "t_mono": facts.t_mono,
