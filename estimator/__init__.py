@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from estimator.lazy_exports import lazy_exports
+from estimator.lazy_exports import exports_of
 
 if TYPE_CHECKING:
     from estimator.cdma.air_interface import PROFILES as PROFILES
@@ -150,4 +150,4 @@ NAMES_OF: Final = {
 """Exported names by module; modules themselves under the empty key."""
 
 if not TYPE_CHECKING:
-    __getattr__, __dir__, __all__ = lazy_exports(__name__, NAMES_OF)
+    __getattr__, __dir__, __all__ = exports_of(__name__, NAMES_OF)

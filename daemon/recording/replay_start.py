@@ -109,28 +109,38 @@ def read_moment(path: Path) -> Moment:
         return Moment(path, float(header["t_state"]), int(header["cycle"]), line, dict(header["versions"]), pieces)
     except OSError as error:
         raise unreadable(path, error) from error
-    except (BadState, KeyError, TypeError, ValueError) as error:
-        raise DataInvalid(str(path), str(error), "take the segments from the next state on") from error
+    except BadState as error:
+        raise DataInvalid(str(path), str(error), error.remedy) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataInvalid(str(path), str(error), BadState.remedy) from error
 
 
 def beginning(recording: Recording, until: float = -math.inf) -> Recording:
     """The recording from its beginning on, or from the last state before ``until`` (t_mono) where that is later.
 
     Its beginning is that of the run, or the first segment that has a state; without any it is the first segment.
-    """
-    from daemon.recording.state_file import BadState, read_header
 
-    begin = None
+    Raises:
+        DataInvalid: the run began before the first segment, and its states are of another format version.
+    """
+    from daemon.recording.state_file import BadState, OtherVersion, read_header
+
+    begin, other = None, None
     for index, segment in enumerate(recording.segments):
         if segment.stem == "000000":
             begin = index if begin is None else begin
             continue
         try:
             header = read_header(state_beside(segment))
+        except OtherVersion as error:
+            other = other or DataInvalid(str(segment.parent), str(error), error.remedy)
+            continue
         except (OSError, BadState, ValueError):
             continue
         if begin is None or float(header.get("t_state", math.inf)) <= until:
             begin = index
+    if begin is None and other is not None:
+        raise other
     segments = recording.segments[begin or 0 :]
     stem = segments[0].stem
     return replace(recording, segments=segments, first=int(stem) if begin is not None and stem.isdigit() else 0)

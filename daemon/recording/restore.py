@@ -33,7 +33,14 @@ FIXED: Final = (Keyframe, Settled, Patch)
 ROOT: Final = -1
 """Number of the piece with all that is small."""
 ESTIMATOR: Final = "estimator."
-"""Numbers only: nothing in there knows the operating system."""
+"""Prefix of the estimator's modules."""
+SYSTEM: Final = frozenset(
+    (
+        *("estimator.lazy_exports", "estimator.numerics.jit", "estimator.numerics.jit_cache"),
+        "estimator.numerics.jit_cache_load",
+    )
+)
+"""Modules of the estimator that import modules or read files: nothing of them belongs into a state."""
 PARTS: Final = frozenset(
     (
         *("daemon.snapshot", "daemon.devices.conversion", "daemon.health.faults", "daemon.health.reasons"),
@@ -127,7 +134,7 @@ def function_within(
     module: str, qualname: str, line: int, held: tuple[object, ...], defaults: tuple[object, ...] | None
 ) -> types.FunctionType:
     """A function within another one, with what it holds."""
-    if not module.startswith(ESTIMATOR):
+    if not _computes(module):
         raise CannotRestore(f"{module}.{qualname} does not belong into a state")
     space = import_module(module).__dict__
     outer = space.get(qualname.partition(".<locals>")[0].partition(".")[0])
@@ -164,7 +171,12 @@ def _ours(kind: object) -> bool:
     """Whether it is a class of the estimator or of what the cycle's memory consists of."""
     if not isinstance(kind, type):
         return False
-    return kind.__module__ in PARTS or kind.__module__.startswith(ESTIMATOR)
+    return kind.__module__ in PARTS or _computes(kind.__module__)
+
+
+def _computes(module: str) -> bool:
+    """Whether a module of the estimator does nothing but compute."""
+    return module.startswith(ESTIMATOR) and module not in SYSTEM
 
 
 @lru_cache(maxsize=1024)
@@ -224,9 +236,9 @@ class _Reader(pickle._Unpickler):
             if f"{module}.{name}" in _CALLED:
                 self._makers.add(id(found))
             return found
-        if (module in PARTS or module.startswith(ESTIMATOR)) and "." not in name:
+        if (module in PARTS or _computes(module)) and "." not in name:
             found = super().find_class(module, name)
-            function = isinstance(found, types.FunctionType) and module.startswith(ESTIMATOR)
+            function = isinstance(found, types.FunctionType) and _computes(module)
             if (function or _ours(found)) and found.__module__ == module:
                 return found
         raise pickle.UnpicklingError(f"{module}.{name} does not belong into a state")

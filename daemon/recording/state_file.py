@@ -37,7 +37,15 @@ _decode: Final = msgspec.msgpack.Decoder(list[tuple[int, str, bytes]]).decode
 
 
 class BadState(Exception):
-    """A state file that cannot be used; the text says what is wrong with it."""
+    """A state file that cannot be used; the text says what is wrong with it, ``remedy`` what to do."""
+
+    remedy = "take the segments from the next state on"
+
+
+class OtherVersion(BadState):
+    """A state file of another format version."""
+
+    remedy = "replay it with the version of lumiloop that recorded it"
 
 
 def write_state(
@@ -102,7 +110,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], bytes, Iterator[Piece]]:
     """The header, what the lidar's line had said, and the pieces.
 
     Raises:
-        OSError: it cannot be read. BadState: it is damaged, or of another version.
+        OSError: it cannot be read. BadState: it is damaged. OtherVersion: of another version.
     """
     data = path.read_bytes()
     header, at = _header(path, data)
@@ -125,10 +133,7 @@ def _header(path: Path, data: bytes) -> tuple[dict[str, Any], int]:
     _, version, length = _START.unpack_from(data)
     end = _START.size + length
     if version != VERSION:
-        raise BadState(
-            f"{path.name}: format version {version}, this program reads {VERSION}; "
-            "replay it with the version that recorded it, or replay the whole recording from its start"
-        )
+        raise OtherVersion(f"{path.name}: format version {version}; this program reads version {VERSION}")
     if len(data) < end + _CRC.size or _CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
         raise BadState(f"{path.name}: damaged head")
     header: dict[str, Any] = json.loads(data[_START.size : end])

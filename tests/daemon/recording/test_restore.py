@@ -18,6 +18,7 @@ from daemon.recording import restore as reading
 from daemon.recording.checkpoint import Taken
 from daemon.recording.restore import ROOT, CannotRestore, Piece, function_within, restore
 from daemon.snapshot import State as Said
+from estimator.lazy_exports import exports_of
 from estimator.measurements import DegradationLevel, Limits
 from estimator.numerics import se2
 
@@ -38,6 +39,8 @@ def taken(content: bytes) -> None:
         ("daemon.recording.disk_writer", "SegmentWriter"),
         ("daemon.devices.conversion", "re"),
         ("estimator.measurements", "np"),
+        ("estimator.lazy_exports", "exports_of"),
+        ("estimator.numerics.jit", "kernel"),
         ("estimator.measurements", "np.ctypeslib.os.system"),
     ],
 )
@@ -47,9 +50,15 @@ def test_a_state_makes_nothing_but_what_a_state_consists_of(module: str, name: s
         taken(pickle.PROTO + b"\x05" + words + pickle.STACK_GLOBAL + pickle.STOP)
 
 
-def test_a_state_takes_no_functions_from_elsewhere() -> None:
-    with pytest.raises(CannotRestore, match="does not belong"):
-        function_within("os", "popen.<locals>.x", 1, (), None)
+@pytest.mark.parametrize(
+    ("module", "qualname"),
+    [("os", "popen.<locals>.x"), ("estimator.lazy_exports", "exports_of.<locals>.package_getattr")],
+)
+def test_a_state_takes_no_functions_from_elsewhere(module: str, qualname: str) -> None:
+    lines = [code.co_firstlineno for code in exports_of.__code__.co_consts if hasattr(code, "co_firstlineno")]
+    for line in (1, *lines):
+        with pytest.raises(CannotRestore, match="does not belong"):
+            function_within(module, qualname, line, ({"os": ("path", "os")}, "os"), None)
 
 
 # --- forged ones: each command of pickle is written by hand, as no honest writer would -------------------------------

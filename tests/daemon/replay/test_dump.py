@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import struct
 import tempfile
 import time
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import pytest
 from daemon.cli import parser
 from daemon.config.schema import Config
 from daemon.health.faults import Fault
-from daemon.recording import checkpoint, disk_writer, flight_recorder
+from daemon.recording import checkpoint, disk_writer, flight_recorder, state_file
 from daemon.recording.disk_writer import CLOCK, SegmentWriter
 from daemon.recording.replay_start import CYCLE_PARTS
 from daemon.recording.retention import ABOUT, DUMP, Flight
@@ -266,3 +268,28 @@ def test_a_damaged_state_is_told_and_named(tmp_path: Path) -> None:
     state.write_bytes(data)
     with pytest.raises(DataInvalid, match=f"{state.name}: damaged"):
         replay(state.parent, Config())
+
+
+def test_a_dump_whose_states_are_of_another_version_is_refused_with_the_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(tmp_path / "rec", long)
+    folder, start = tmp_path / "rec", struct.Struct("<8sHI")
+    assert states(folder)
+    for state in states(folder):
+        data = bytearray(state.read_bytes())
+        magic, version, length = start.unpack_from(data)
+        assert version == state_file.VERSION
+        start.pack_into(data, 0, magic, version - 1, length)
+        end = start.size + length
+        struct.pack_into("<I", data, end, zlib.crc32(data[:end]))
+        state.write_bytes(data)
+    assert parser.main(["replay", str(folder), "--out", str(tmp_path / "whole")]) == console.OK
+    first = states(folder)[0]
+    for segment in first.parent.glob("*.lumirec"):
+        if segment.stem < first.stem:
+            segment.unlink()
+    assert parser.main(["replay", str(folder), "--out", str(tmp_path / "part")]) == console.FAILED
+    said = capsys.readouterr().err
+    assert f"format version {state_file.VERSION - 1}; this program reads version {state_file.VERSION}" in said
+    assert "replay it with the version of lumiloop that recorded it" in said
