@@ -91,7 +91,7 @@ class Source(ABC):
         """Yields all events in order."""
 
     def utc(self, t_mono: float) -> float:
-        """Returns the log's own stamp for an instant of the virtual clock, s, where that stamp continues without scans."""
+        """Returns the log's own stamp, s, for an instant of the virtual clock, if it has one without scans."""
         return t_mono
 
     @abstractmethod
