@@ -19,7 +19,7 @@ from estimator.paper import LUMILOOP, METHODS
 LONGEST_RING: Final = 1440.0
 """Longest ring, minutes; a longer recording is kept whole."""
 PICTURES: Final = (".png", ".svg", ".pdf")
-"""Suffixes of picture files that can be written."""
+"""Suffixes of image files that can be written."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -59,9 +59,9 @@ class Hall:
 
 
 def read_hall(path: Path, spacing: float) -> Hall:
-    """Returns the plan in an image of map_server (its YAML file, or the image beside it), or in a map file.
+    """Returns the plan in an image of map_server or in a map file.
 
-    ``spacing``: between possible lamp positions, m.
+    ``path``: YAML file, the image beside it, or a map file. ``spacing``: between possible lamp positions, m.
 
     Raises:
         NoHall: the plan cannot be used.
@@ -157,7 +157,10 @@ def _on_grid(mask: Mask, cell: float, step: float) -> Array:
 
 
 def clear(blocked: Mask, cell: float, start: Array, ends: Array) -> Mask:
-    """Returns (n,) whether the straight line from ``start`` (2,) to each ``ends`` (n, 2), m, crosses no blocked cell."""
+    """Returns (n,) whether the straight line from ``start`` (2,) to each of ``ends`` (n, 2) crosses no blocked cell.
+
+    M.
+    """
     if not len(ends):
         return np.zeros(0, np.bool_)
     longest = float(np.hypot(*(ends - start).T).max())

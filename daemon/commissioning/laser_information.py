@@ -23,7 +23,7 @@ BEAM_SIGMA_M: Final = 0.15
 KNOWN_SIGMA_M: Final = 0.10
 """An axis with a larger sigma, m, is not known; the same as `estimator.result.KNOWN`."""
 STEEPEST: Final = 0.3
-"""Smallest usable cosine to a wall's normal; beams at a smaller grazing angle are unreliable."""
+"""Smallest usable cosine between a beam and a wall's normal; beams that graze a wall more are unreliable."""
 _FINE_CELLS, _COARSE_CELLS = 0.7, 1.5
 _CHUNK: Final = 400
 

@@ -1,9 +1,9 @@
 """Light information on the position at a place, from each received lamp: Eq. 1, its derivative, and its uncertainties.
 
-For level lamp and receiver, ln of the RSS has the gradient -(m_t + m_r + 2) (p - l) / d^2 (Eq. 7). Its variance is that
-of `estimator.paper.lateration_model.usable`: the lamp's own power, the tilt of ceiling and robot, and light by way of
-walls. All links share the receiver's gain. The Sherman-Morrison formula eliminates it, so that the information of lamps
-at a place adds up.
+Lamp and receiver are level. The gradient of ln of the RSS is then -(m_t + m_r + 2) (p - l) / d^2 (Eq. 7). Its variance
+is that of `estimator.paper.lateration_model.usable`. It contains the lamp's own power, the tilt of ceiling and robot,
+and light by way of walls. All links share the receiver's gain. The Sherman-Morrison formula eliminates it, so that the
+information of lamps at a place adds up.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Calibration of odometry and laser mount from a drive, and its findings as text and configuration."""
+"""Calibration of odometry and lidar mount from a drive, and its findings as text and configuration."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Recorded teach drive: poses by the lidar alone, and the RSS of each lamp at these poses.
 
-The poses are those of a replay without lights, by the final map, so that the calibrated quantities do not affect them.
-The light is decoded again from the recorded blocks, with the effort that a computer without a robot to drive permits.
+The poses are those of a replay without lights, by the final map. The calibrated quantities therefore do not affect
+them. The light is decoded again from the recorded blocks. A computer without a robot to drive permits more effort for
+that than a cycle.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class NoMoment(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A recording, or the part of one without a step of the clock, and the time (UTC, s) that it covers.
+    """A recording, or its part between two steps of the clock, and the time (UTC, s) that it covers.
 
     Attributes:
         utc_at_zero: UTC at zero of its monotonic clock, s. made: software that made it, empty if it is the present one.

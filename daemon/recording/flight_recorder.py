@@ -212,8 +212,8 @@ class BlackBox:
     def close(self, ended: bool) -> None:
         """Finishes pending work; called after the disk writer has closed.
 
-        A dump that still waits for the time after its fault is made at once, because the next start removes the ring. It
-        needs no checkpoint of its own, since nothing follows it.
+        The next start removes the ring. A dump that still waits for the time after its fault is therefore made at once.
+        It needs no checkpoint of its own, since nothing follows it.
         """
         if self._pending is not None:
             (_, fault), self._pending = self._pending, None

@@ -165,7 +165,7 @@ class Recorder:
     """Records a running daemon. No method blocks, and no disk error raises, except in :meth:`keep_switch`.
 
     :meth:`tap` wraps the port opener of a driver. :meth:`on_scan`, :meth:`on_samples`, :meth:`on_odometry` and
-    :meth:`on_imu` wrap the callbacks of the sources. :meth:`on_cycle` is the tap of the cycle.
+    :meth:`on_imu` wrap the callbacks of the sources. :meth:`on_cycle` observes the cycle.
 
     Attributes:
         t_begun: start of the run as in the head, s; an input without data counts as timed out from then on.

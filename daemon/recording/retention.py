@@ -353,8 +353,8 @@ def _prune_dumps(parent: Path, made: Path) -> None:
 def _spare_dumps(parent: Path, made: Path | None) -> list[Path]:
     """Returns the dumps that may be removed to make room, oldest first and requested ones last.
 
-    The newest dump is never among them. It is the one ``made`` by this run, or else the last by the clock, which may
-    have been set meanwhile.
+    The newest dump is never among them. It is the one ``made`` by this run, or else the last by the clock. The clock
+    may have been set meanwhile.
     """
     dumps = sorted((path.stat().st_mtime, path.name, path) for path in parent.glob(f"{DUMP}*") if path.is_dir())
     newest = made if made is not None and made.exists() else dumps[-1][2] if dumps else None

@@ -67,7 +67,7 @@ class Laser:
 
 @dataclass(frozen=True)
 class Scans:
-    """Stamps (n,) in s, ranges (n, beams) in mm, poses (n, 3) of the robot by its odometry (m, m, rad)."""
+    """Stamps (n,) in s, ranges (n, beams) in mm, robot poses (n, 3) by odometry in m, m, rad."""
 
     laser: Laser
     stamps: Array

@@ -1,4 +1,4 @@
-"""Stage times of a cycle in us, their quantiles over the last minute, and the stage in which a stall occurred."""
+"""Stage times of a cycle in us, their quantiles over the last minute, and the stage of a stall."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ URGENT: Final = 2
 """Jobs with this priority or a lower number do not wait for others."""
 
 SWITCH_S: Final = 5e-4
-"""Time after which a thread in Python yields, s. With the interpreter's own 5 ms, a cycle would wait after each of its
+"""Time after which a thread in Python yields, s. With the interpreter's own 5 ms, a cycle waits after each of its
 kernels while a job prepares its data."""
 
 TRIES: Final = 3
