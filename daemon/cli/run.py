@@ -56,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
     start_log()
     settings: Config = args.settings
     log.info("%s: configuration\n%s", settings.name, loader.dump(settings).rstrip())
-    for other in streams_served(settings.name):  # need not be a mistake, but each device has one owner
+    for other in streams_served(settings.name):  # this may be intended, but each device has one owner
         log.warning("a daemon named %s runs on this computer already (%s): %s", settings.name, other, SECOND)
     recorder = None
     give_back()

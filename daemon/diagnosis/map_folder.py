@@ -89,4 +89,4 @@ def _keeper(lock: Path) -> str:
             words = line.split()  # 3: FLOCK  ADVISORY  WRITE 1234 08:01:5678 0 EOF
             if "FLOCK" in words and words[-3] == named:
                 return f"process {words[-4]}"
-    return "another process"  # in another container, or on a file system with other numbers here
+    return "another process"  # in another container, or on a file system with different device numbers

@@ -116,8 +116,8 @@ def first_change(told: Sequence[Moment], utc: float, wide: float) -> int | None:
 def chosen(told: Sequence[Moment], utc: float, second: bool, wide: float) -> Chosen:
     """Returns the cycle for a time that lasts from ``utc`` for ``wide``, s, more than 0.
 
-    For a whole ``second`` it is the cycle of the first change, else the first cycle. For another time it is the last
-    cycle that began before the time's end, since that time may be a printed and truncated one.
+    For a whole ``second`` it is the cycle of the first change, else the first cycle. Another time may be a printed and
+    truncated one: it gives the last cycle that began before the time's end.
     """
     end = end_of(utc, wide)
     if not second:

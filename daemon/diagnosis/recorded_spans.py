@@ -151,7 +151,7 @@ def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, f
         if utc <= span.end and (begin := max(utc, span.begin)) < end
     ]
     if here:
-        # Of the parts of one recording that which holds the time's begin, and of several the latest.
+        # Of one recording's parts, use the one with the time's begin; of several such parts, the latest.
         part = {one[0].path: one[0] for one in sorted(here, key=lambda one: one[3])}
         there = [one for one in here if one[0] is part[one[0].path]]
         return max(there, key=_has_before)[:3]

@@ -109,7 +109,7 @@ class SegmentWriter:
         self._synced_at = time.monotonic()
         self._dirty = False
         self._stop = threading.Event()
-        self.folder = parent / f"{name}-{token_hex(4)}"  # random, as the folder may be made later: unique unseen
+        self.folder = parent / f"{name}-{token_hex(4)}"  # random suffix: unique even if made later
         try:
             self.folder = _new_folder(parent, name)
             self._open()

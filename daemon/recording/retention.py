@@ -158,7 +158,7 @@ class Flight:
             self._ring = -1
 
     def _work(self) -> None:
-        with contextlib.suppress(OSError, AttributeError):  # the cycle goes first wherever both want the processor
+        with contextlib.suppress(OSError, AttributeError):  # the cycle has precedence on a busy processor
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
         while (task := self._tasks.get()) is not None:
             try:
