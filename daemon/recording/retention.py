@@ -133,17 +133,13 @@ class Flight:
         self._tasks.put(partial(self._keep, begun))
 
     def dump(self, about: dict[str, Any], on_done: OnDone) -> None:
-        """Makes a dump of the present segments.
-
-        ``on_done``: called in the retention thread with an empty text or the error.
-        """
+        """Makes a dump; ``on_done``: called in the retention thread with an empty text or the error."""
         self._tasks.put(partial(self._dump, about, on_done))
 
     def close(self, ended: bool) -> None:
-        """Finishes pending work, for at most :data:`CLOSE_S`.
+        """Finishes pending work, for at most :data:`CLOSE_S`. ``ended``: the run ended as intended.
 
-        ``ended``: the run ended as intended; otherwise the next start keeps the ring as a dump. The same applies if a
-        requested dump is missing, since only the ring has its data.
+        Otherwise, or if a requested dump is missing, the next start keeps the ring as a dump: only it has the data.
         """
         self._tasks.put(None)
         self._thread.join(CLOSE_S)
@@ -237,7 +233,7 @@ class Flight:
         return RESERVE_BYTES - room
 
     def _lacks_room(self) -> bool:
-        """Removes dumps; True if room is still missing. The disk may free their room only later."""
+        """Removes dumps if room is missing; True if it still is. The disk may free their room only later."""
         lacking = self._lacking()
         with contextlib.suppress(OSError):  # a dump that cannot be removed: segments are removed instead
             for dump in _spare_dumps(self._folder.parent, self._made) if lacking > 0 else ():
@@ -340,10 +336,7 @@ def _free(path: Path) -> Path:
 
 
 def _prune_dumps(parent: Path, made: Path) -> None:
-    """Removes the oldest dumps by name, never the one just ``made``: the clock may not be set yet.
-
-    Requested dumps and the others are counted separately.
-    """
+    """Removes the oldest dumps by name, requested ones separately; keeps ``made``, as the clock may not be set."""
     asked = _was_asked(made)
     others = sorted(path for path in parent.glob(f"{DUMP}*") if path != made and _was_asked(path) == asked)
     for old in others[: 1 - (ASKED_DUMPS if asked else DUMPS)]:
@@ -353,8 +346,8 @@ def _prune_dumps(parent: Path, made: Path) -> None:
 def _spare_dumps(parent: Path, made: Path | None) -> list[Path]:
     """Returns the dumps that may be removed to make room, oldest first and requested ones last.
 
-    The newest dump is never among them. It is the one ``made`` by this run, or else the last by the clock. The clock
-    may have been set meanwhile.
+    The newest dump is never among them: the one ``made`` by this run, or else the last by a clock that may have been
+    set.
     """
     dumps = sorted((path.stat().st_mtime, path.name, path) for path in parent.glob(f"{DUMP}*") if path.is_dir())
     newest = made if made is not None and made.exists() else dumps[-1][2] if dumps else None
@@ -385,7 +378,7 @@ def _begin_ring(folder: Path) -> tuple[int, Path | None]:
 
 
 def _see_to(mark: Path) -> Path | None:
-    """Handles the ring of an earlier run: removes it if that run ended as intended, otherwise makes it a dump."""
+    """Handles the ring of an earlier run: removes it after an intended end, otherwise makes it a dump."""
     kept: Path | None = None
     try:
         with mark.open("rb") as file:
