@@ -1,1 +1,1 @@
-"""The `lumiloop` command: one module for each command."""
+"""Bodies of the `lumiloop` commands: one module for each command, and the parser of the command line."""

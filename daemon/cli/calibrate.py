@@ -1,8 +1,8 @@
-"""`lumiloop calibrate REC`: what lamps and receiver really are, from a recorded drive, with uncertainties.
+"""`lumiloop calibrate REC`: calibrates lamps and receiver, or odometry and lidar mount, from a recorded drive.
 
-Prints residuals before and after and every parameter with its sigma, writes the survey anew with the residual map
-beside it, and a picture; for wheels and laser mount the configuration anew (`daemon/commissioning/odometry.py`).
-Nothing that is there is overwritten unless ``--force`` says so.
+Prints residuals before and after, and every parameter with its sigma. Writes the calibrated survey, the residual map
+beside it, and a plot. For odometry and lidar mount it writes the configuration (`daemon/commissioning/odometry.py`).
+Existing files are replaced only with ``--force``.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ from hal.errors import HalError
 SURVEY_OUT = Path("lights-calibrated.toml")
 CONFIG_OUT = Path("lumiloop-calibrated.toml")
 FRAME = Priors(frame=0.15, frame_yaw=0.05)
-"""The alignment found from lamp places is good to this."""
+"""Sigmas of the alignment found from lamp positions."""
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command's body; returns the exit code."""
+    """Runs the command; returns the exit code."""
     keys = tuple(override.partition("=")[0].strip() for override in args.set)
     wheels = args.odometry or args.lidar_mount
     args.out = args.out or (CONFIG_OUT if wheels else SURVEY_OUT)
     try:
-        refuse_overwriting(args.out, args.force)  # before the work is done, not after it
+        refuse_overwriting(args.out, args.force)  # before the work, not after it
         drive = read_drive(args.log, args.settings, Given(args.config is not None, keys))
         if drive.stopped:
             sys.stderr.write(f"lumiloop: {drive.stopped}; the drive up to there is used\n")
@@ -87,10 +87,12 @@ def _lights(args: argparse.Namespace, drive: Drive) -> int:
 
 
 def found_frame(given: Survey, strengths: Heard) -> Array:
-    """Where the drive began in the survey's frame, from the lamps it can locate by itself.
+    """Returns the start of the drive in the survey's frame, from the lamps that the drive locates.
+
+    The start is (x, y, yaw), m, m, rad.
 
     Raises:
-        Unaligned, TooLittle: not to be found; --start says it instead.
+        Unaligned, TooLittle: there is no unique alignment; --start gives it instead.
     """
     try:
         z = float(np.median([lamp.z for lamp in given.lamps]))
@@ -102,14 +104,14 @@ def found_frame(given: Survey, strengths: Heard) -> Array:
 
 
 def in_survey(found: Calibrated, rows: Rows) -> Rows:
-    """The rows with their poses in the survey's frame."""
+    """Returns the rows with their poses in the survey's frame."""
     theta = np.zeros(COMMONS)
     theta[Common.FRAME_X : Common.FRAME_YAW + 1] = found.T_survey_drive
     return Rows(placed(theta, rows.pose), rows.lamp, rows.amplitude, rows.sigma, rows.t)
 
 
 def report(found: Calibrated, residuals: ResidualMap) -> str:
-    """All of it for people."""
+    """Returns the results as text."""
     before, after = found.rms()
     x, y, yaw = found.T_survey_drive
     used, total = int(found.used.sum()), len(found.used)
@@ -134,14 +136,14 @@ def report(found: Calibrated, residuals: ResidualMap) -> str:
 
 
 def line(e: Estimate) -> str:
-    """One parameter."""
+    """Returns the text line of one parameter."""
     lamp = "all" if e.lamp_id is None else str(e.lamp_id)
     told = "" if e.told else "  not told by this drive"
     return f"{lamp:>6} {e.name:<12} {e.before:>10.4f} {e.after:>10.4f} {e.sigma:>9.4f} {e.unit}{told}".rstrip()
 
 
 def notes(drive: Drive, found: Calibrated) -> list[str]:
-    """The head of the written survey."""
+    """Returns the head comments of the written survey."""
     before, after = found.rms()
     return [
         f"Calibrated from {drive.path.name}: residual of ln strength {before:.4f} before, {after:.4f} after (rms).",
@@ -150,7 +152,7 @@ def notes(drive: Drive, found: Calibrated) -> list[str]:
 
 
 def remarks(found: Calibrated) -> dict[int, str]:
-    """Behind each lamp: the sigmas of what the drive told."""
+    """Returns a comment for each lamp: the sigmas of the parameters that the drive determines."""
     said: dict[int, list[str]] = {}
     for e in found.estimates:
         if e.lamp_id is not None and e.lamp_id not in found.untouched:
@@ -159,15 +161,17 @@ def remarks(found: Calibrated) -> dict[int, str]:
 
 
 def calibrate_wheels(drive: Drive, args: argparse.Namespace) -> int:
-    """Fit, say it, and write configuration and picture; returns the exit code.
+    """Fits odometry and mount, prints the result, writes configuration and plot; returns the exit code.
 
     Args:
         drive: with odometry in it.
-        args: ``odometry``, ``lidar_mount``: what is asked for; ``out``, ``force``: where the configuration goes.
+        args: ``odometry``, ``lidar_mount``: requested parts; ``out``, ``force``: path of the configuration, and whether
+        to
+            replace it.
 
     Raises:
         DataInvalid: no odometry in the recording, or too little motion.
-        ConfigError: the configuration cannot be written, or is there.
+        ConfigError: the configuration cannot be written, or exists.
     """
     fit = fit_drive(drive)
     found = findings(fit, args.odometry, args.lidar_mount)

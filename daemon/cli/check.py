@@ -1,4 +1,4 @@
-"""``lumiloop check``: whether configuration, survey and maps are good, and whether the photodiode's bus is here."""
+"""``lumiloop check``: checks configuration, survey and maps, and looks for the photodiode's bus."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from daemon.system import console
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command ``check``: all that is wrong, in one round; returns the exit code.
+    """Runs the command ``check``: lists all defects in one run; returns the exit code.
 
-    A bus that is not here is a remark, not a refusal: files are also checked on other computers.
+    A missing bus is a remark, not a defect: files are also checked on other computers.
     """
     wrong, gone = list[tuple[int, str]](), frozenset[str]()
     settings: Config | None

@@ -1,7 +1,7 @@
-"""`lumiloop codes`: the code tables of a profile, for whoever builds a lamp. Needs numpy, not the kernels.
+"""`lumiloop codes`: prints the code tables of an air interface profile for lamp builders. Needs numpy, not the kernels.
 
-Bits are as in docs/air-interface.md: the bit that is sent first stands first (the highest bit of the first byte in C);
-a half chip of 1 is bright, 0 is dark, for a data bit of 0.
+Bits are as in docs/air-interface.md: the first bit sent comes first (the highest bit of the first byte in C). A half
+chip of 1 is bright, 0 is dark, for a data bit of 0.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Row = tuple[int, str, str]
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command's body; returns the exit code."""
+    """Runs the command; returns the exit code."""
     profile = PROFILES[args.profile]
     rows = table(profile)
     if args.code is not None:
@@ -32,7 +32,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def table(profile: Profile) -> list[Row]:
-    """All codes of a profile."""
+    """Returns all codes of a profile."""
     rows = []
     for number, chips in enumerate(gold_codes(profile.degree)):
         bits = "".join("1" if chip < 0 else "0" for chip in chips)
@@ -41,18 +41,18 @@ def table(profile: Profile) -> list[Row]:
 
 
 def manchester(chips: str) -> str:
-    """Half chips of a string of chips: chip 0 is bright then dark, chip 1 dark then bright."""
+    """Returns the half chips of a string of chips: chip 0 is bright then dark, chip 1 dark then bright."""
     return chips.replace("0", "a").replace("1", "01").replace("a", "10")
 
 
 def as_csv(profile: Profile, rows: Sequence[Row]) -> str:
-    """A line per code, after a header."""
+    """Returns a header and one line per code."""
     del profile
     return "code,chips,half_chips\n" + "".join(f"{number},{chips},{halves}\n" for number, chips, halves in rows)
 
 
 def as_json(profile: Profile, rows: Sequence[Row]) -> str:
-    """One object: what the profile prescribes, and the codes."""
+    """Returns one object: the parameters of the profile, and the codes."""
     facts = {
         "profile": profile.name,
         "chip_rate_hz": profile.chip_rate,
@@ -66,7 +66,7 @@ def as_json(profile: Profile, rows: Sequence[Row]) -> str:
 
 
 def as_c(profile: Profile, rows: Sequence[Row]) -> str:
-    """A C99 header with two tables of packed bits; rows stand in the order of their code numbers."""
+    """Returns a C99 header with two tables of packed bits, in the order of code numbers."""
     name, length = f"lumiloop_{profile.name.lower()}", profile.length
     codes = f"code {rows[0][0]}" if len(rows) == 1 else f"codes {rows[0][0]} to {rows[-1][0]}"
     return (

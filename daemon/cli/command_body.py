@@ -1,4 +1,4 @@
-"""How a command's body is found and run: its module is loaded when the command runs, with the configuration resolved.
+"""Loading of command bodies: imports a command's module when it runs, with the configuration resolved.
 
 Options that several commands share are here, too.
 """
@@ -21,7 +21,7 @@ Body = Callable[[argparse.Namespace], int]
 
 
 def config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None:
-    """The options of every command that reads the configuration; see :func:`configured`."""
+    """Adds the options of every command that reads the configuration; see :func:`configured`."""
     if file:
         parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file; default: built-in values")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrule one key")
@@ -29,12 +29,12 @@ def config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None
 
 
 def later(module: str, name: str) -> Body:
-    """A body that resolves the configuration (``args.settings``, a `Config`) and then loads its module."""
+    """Returns a body that resolves the configuration (``args.settings``, a `Config`) and then loads its module."""
     return configured(loaded(module, name))
 
 
 def estimating(module: str, name: str, what: str = "warm") -> Body:
-    """As `later`, for a module that imports ``what`` of the estimator: the minute that it may compile is announced."""
+    """Like `later`, for a module that imports ``what`` of the estimator: announces a compilation of about a minute."""
 
     def body(args: argparse.Namespace) -> int:
         from daemon.runtime import warmup
@@ -49,7 +49,7 @@ def estimating(module: str, name: str, what: str = "warm") -> Body:
 
 
 def loaded(module: str, name: str) -> Body:
-    """A body that loads its module when it runs."""
+    """Returns a body that loads its module when it runs."""
 
     def body(args: argparse.Namespace) -> int:
         run: Body = getattr(import_module(module), name)
@@ -59,7 +59,7 @@ def loaded(module: str, name: str) -> Body:
 
 
 def configured(body: Body) -> Body:
-    """A body that is run with the resolved configuration as ``args.settings``."""
+    """Returns a body that runs with the resolved configuration as ``args.settings``."""
 
     def resolve_and_run(args: argparse.Namespace) -> int:
         from daemon.config import loader
@@ -80,7 +80,7 @@ def configured(body: Body) -> Body:
 
 
 def listening(parser: argparse.ArgumentParser) -> None:
-    """The options that say which daemon to listen to; ``args.stream``: Path or None for the configuration's."""
+    """Adds the options that select a running daemon; ``args.stream``: Path, or None for the configuration's stream."""
     parser.add_argument(
         "--stream", type=Path, metavar="SOCKET", help="the daemon's local stream; default: that of the configured name"
     )
@@ -88,7 +88,7 @@ def listening(parser: argparse.ArgumentParser) -> None:
 
 
 def needing(extra: str, module: str, name: str) -> Body:
-    """A body that resolves the configuration and then loads its module, which needs an extra of the package."""
+    """Returns a body that resolves the configuration and loads its module, which needs an extra of the package."""
 
     def body(args: argparse.Namespace) -> int:
         try:

@@ -1,4 +1,4 @@
-"""``lumiloop convert``: recorded lidar data of other formats, turned into a log that `lumiloop replay` reads."""
+"""``lumiloop convert``: converts recorded lidar data of other formats to a log for `lumiloop replay`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from daemon.system import console
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command ``convert``; returns the exit code."""
+    """Runs the command ``convert``; returns the exit code."""
     delay = convert.DELAY_S if args.delay is None else args.delay
     try:
         scans = convert.convert(args.source, args.log, args.logged, delay, args.all)

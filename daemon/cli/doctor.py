@@ -1,4 +1,4 @@
-"""`lumiloop doctor`: runs every check and tells a person, or a program, what to fix first."""
+"""`lumiloop doctor`: runs every check and prints, as text or JSON, what to repair first."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _WORDS = {Level.GOOD: "good", Level.REMARK: "note", Level.FIX: "FIX"}
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command's body; returns 0 where nothing has to be fixed, 1 else, 2 for a configuration that is wrong."""
+    """Runs the command; returns 0 if nothing needs repair, 1 otherwise, 2 for a wrong configuration."""
     return examine(args, Host())
 
 
 def examine(args: argparse.Namespace, host: Host) -> int:
-    """The same, of a given computer."""
+    """Runs the command on a given computer."""
     try:
         settings = loader.load(args.config, list(args.set))
     except loader.ConfigError as error:

@@ -1,6 +1,6 @@
-"""``lumiloop explain WORD``: what a key, a state, a number in the log or a register means, and what to do about it.
+"""``lumiloop explain WORD``: explains a key, a state, a number in the log or a register, and gives the remedy.
 
-Everything comes from the tables that the daemon itself works by, so that an explanation cannot lag behind it.
+All texts come from the tables that the daemon itself uses, so that an explanation cannot become outdated.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ _PORTS: Final = (
     (9464, "METRICS", "where `lumiloop metrics` serves Prometheus", "`--listen` sets another"),
     (7447, "ZENOH_ROUTER", "where `lumiloop fleet` and `lumiloop ros2` look for it", "`--router` sets another"),
 )
-"""Ports that are used where nobody has said otherwise."""
+"""Default ports."""
 _MOST: Final = 12
-"""Explanations shown for one word; a whole table of keys has fewer."""
+"""Explanations printed for one word; a whole table of keys has fewer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Something that can be asked about.
+    """An item that can be explained.
 
     Attributes:
-        kind: fault, reason, configuration key... name: how it is written. numbers: that stand for it.
-        text: what it is. remedy: what to do, empty where there is nothing to be done.
+        kind: fault, reason, configuration key... name: as it is written. numbers: that identify it.
+        text: its meaning. remedy: what to do, empty if nothing needs to be done.
     """
 
     kind: str
@@ -68,7 +68,7 @@ class Entry:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Body of the command; ``args.words`` is what was asked: one word, or a kind and a word as in `fault 302`."""
+    """Runs the command; ``args.words``: one word, or a kind and a word as in `fault 302`."""
     asked = " ".join(args.words).strip().strip("`")
     everything = list(entries())
     found = find(asked, everything)
@@ -94,7 +94,7 @@ def _hint(asked: str, everything: Sequence[Entry]) -> str:
 
 
 def entries() -> Iterator[Entry]:
-    """All that can be asked about."""
+    """Yields all items that can be explained."""
     for option in loader.options():
         default = loader.value_text(option.default)
         yield Entry(
@@ -140,7 +140,7 @@ def _points(kind: str, start: int, layout: Layout) -> Iterator[Entry]:
 
 
 def _elsewhere(point: Point) -> str:
-    """The point's text, with what to ask where the documents point to a table below."""
+    """Returns the point's text, with the command to run in place of a reference to a table."""
     kind = "link use" if point.name.endswith("_use") else point.name
     text = point.text.replace("Bits, see below", "Bits; what each means: lumiloop explain bit NUMBER")
     return text.replace("See below", f"What each means: lumiloop explain {kind} NUMBER")
@@ -151,7 +151,10 @@ def _one(code: IntEnum) -> range:
 
 
 def find(asked: str, everything: Sequence[Entry]) -> list[Entry]:
-    """Entries of that number or name, of one kind where the first words name it; a table's name gives its keys."""
+    """Returns the entries of a number or name, of one kind if the first words name it.
+
+    A table's name gives its keys.
+    """
     kind, _, last = asked.lower().rpartition(" ")
     of_kind = [entry for entry in everything if kind in entry.kind]
     if last.isascii() and last.isdigit():

@@ -1,4 +1,4 @@
-"""`lumiloop lamps`: gathers what the maps say of the lamps, and tells which need somebody to come."""
+"""`lumiloop lamps`: collects the lamps' gain history from the maps and lists the lamps that need service."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from daemon.system import console
 
 FILE: Final = "lamps.csv"
 TOGETHER: Final = -0.02
-"""A year; that all lamps dim by so much together is worth a word."""
+"""Relative change a year, common to all lamps, below which it is reported."""
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command's body; returns 0 where no lamp is urgent, 1 else."""
+    """Runs the command; returns 0 if no lamp is urgent, 1 otherwise."""
     return tell(args, Host())
 
 
 def tell(args: argparse.Namespace, host: Host) -> int:
-    """The same, on a given computer."""
+    """Runs the command on a given computer."""
     settings: Config = args.settings
     if not settings.map.kept and args.history is None:
         return console.fail("maps are not kept (`map.folder` is none), and so is nothing known of lamps", console.USAGE)
@@ -61,7 +61,7 @@ def tell(args: argparse.Namespace, host: Host) -> int:
 
 
 def _said_of(heard: Heard) -> dict[int, int]:
-    """What the daemon uses each lamp for; dead or moved only where its faults say so: a passing shadow is none."""
+    """Returns the daemon's use of each lamp; dead or moved only with the fault, since a passing shadow is neither."""
     lasts = standing(heard)
     return {lamp: use for (_, lamp), use in heard.lamps.items() if lamp is not None and lasts(use)}
 

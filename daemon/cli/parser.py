@@ -1,6 +1,6 @@
-"""The command line. Each command's body is imported only when it runs, so that small commands stay small.
+"""Parser of the command line. Each command's body is imported only when it runs, so that small commands stay small.
 
-Exit codes: 0 done, 1 it failed (the text says what and what to do), 2 wrong usage or configuration, 130 interrupted.
+Exit codes: 0 done, 1 failed (the text gives cause and remedy), 2 wrong usage or configuration, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from daemon.system.console import INTERRUPTED, OK, USAGE, fail
 from estimator.paper import LUMILOOP, METHODS
 
 LONGEST_RING: Final = 1440.0
-"""Minutes; whoever wants more keeps all of it."""
+"""Longest ring, minutes; a longer recording is kept whole."""
 PICTURES: Final = (".png", ".svg", ".pdf")
-"""Endings of files that can be drawn."""
+"""Suffixes of image files that can be written."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code. Wrong usage raises SystemExit(2) after explaining itself."""
+    """Runs one command; returns the exit code. Wrong usage raises SystemExit(2) after an explanation."""
     try:
         words = parser()
         args = words.parse_args(argv)
@@ -35,12 +35,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
-        sys.stderr.close()  # whoever read our output has gone; there is nobody to tell
+        sys.stderr.close()  # the reader of our output has closed it
         return OK
 
 
 def parser() -> argparse.ArgumentParser:
-    """Every command with its options; ``body`` of what it parses is the :data:`Body` to run."""
+    """Returns the parser of every command; ``body`` of its result is the :data:`Body` to run."""
     parser = argparse.ArgumentParser(
         prog="lumiloop",
         description="Indoor robot localisation from a 2D lidar and coded ceiling lights: a pose over Modbus and UDP. "

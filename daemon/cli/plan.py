@@ -1,4 +1,4 @@
-"""`lumiloop plan MAP`: chooses lamps for a floor, says what comes of them, writes them as a survey, and draws it."""
+"""`lumiloop plan MAP`: selects lamps for a floor, prints their effect, writes them as a survey, and plots them."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from estimator import Lamp, Receiver, Survey
 HEADROOM_M: Final = 0.2
 HIGHEST_M: Final = 30.0
 OPEN_M: Final = 1.0
-"""An axis with a larger deviation is as good as unknown."""
+"""An axis with a larger sigma, m, counts as unknown."""
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command's body; returns the exit code."""
+    """Runs the command; returns the exit code."""
     if wrong := _wrong(args):
         return console.fail(wrong, console.USAGE)
     try:
@@ -70,7 +70,7 @@ def _wrong(args: argparse.Namespace) -> str:
 
 
 def _hung(args: argparse.Namespace) -> Survey | None:
-    """Lamps that are to be judged; None: they are to be chosen."""
+    """Returns the lamps to be judged; None: lamps are to be selected."""
     if args.survey is None:
         return None
     survey = read_survey(args.survey, profile_of(args.settings.photodiode))
@@ -86,10 +86,10 @@ def _receiver(settings: Config) -> Receiver:
 
 
 def fitting_of(receiver: Receiver, height: float) -> Fitting:
-    """Lamps ``height`` m above the floor, as this receiver sees them.
+    """Returns the parameters of lamps ``height`` m above the ground with this receiver.
 
     Raises:
-        NoHall: they would not hang above it.
+        NoHall: the lamps would not be above the receiver.
     """
     if height - receiver.z < HEADROOM_M:
         raise NoHall(f"lamps at {height:g} m are not above the receiver at {receiver.z:g} m: give --height")
@@ -104,7 +104,7 @@ def _in_plan(hall: Hall, xy: Array) -> Array:
 
 
 def report(hall: Hall, plan: Plan, goals: Goals, fitting: Fitting) -> str:
-    """What a person reads."""
+    """Returns the results as text."""
     area = len(hall.places) * hall.step**2
     blind = wall_sigma(plan) > KNOWN_SIGMA_M
     still = plan.sigma > KNOWN_SIGMA_M
@@ -130,7 +130,7 @@ def report(hall: Hall, plan: Plan, goals: Goals, fitting: Fitting) -> str:
 
 
 def wall_sigma(plan: Plan) -> Array:
-    """(n,) m, of the worse axis, from the laser alone."""
+    """(n,) sigma of the worse axis by the lidar alone, m."""
     from daemon.commissioning.light_information import worst
 
     return worst(plan.walls)[0]
@@ -141,7 +141,7 @@ def _percent(which: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> str:
 
 
 def deviations(sigma: Array) -> str:
-    """Of places, (n,) m of the worse axis, in words; from :data:`OPEN_M` on, no length is told."""
+    """Returns a text on sigmas (n,), m, of the worse axis; above :data:`OPEN_M` no length is given."""
     median, most = _quantiles(sigma)
     middle = f"median {100.0 * median:.1f} cm" if median <= OPEN_M else f"median over {OPEN_M:g} m"
     if most <= OPEN_M:

@@ -1,4 +1,4 @@
-"""``lumiloop probe``: find lidars and photodiode converters, say what they are, or what is wrong and what to do."""
+"""``lumiloop probe``: finds lidars and photodiode converters; prints what they are, or the defect and its remedy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Found = Finding | BusFinding
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command ``probe``; 0 when a lidar or a converter was found, and one at every device named."""
+    """Runs the command ``probe``; 0 if a lidar or a converter was found, and one at every named device."""
     devices = list(args.devices) or [*discover.candidates(), *i2c_linux.buses()]
     if not devices and not args.json:
         sys.stderr.write(NOTHING)
@@ -45,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _look(places: dict[str, LidarPlace], quiet: bool) -> list[Found]:
-    """``places``: by what a person writes for them."""
+    """Examines the devices; ``places``: by the text that the user wrote for them."""
     findings: list[Found] = []
     for device, place in places.items():
         if not quiet:
@@ -70,7 +70,7 @@ def _usable(finding: Found) -> bool:
 
 
 def describe(finding: Found, device: str) -> str:
-    """What a person wants to read: the line and how to use it; ``device``: as it was written."""
+    """Returns the text of a finding and how to use it; ``device``: as the user wrote it."""
     if isinstance(finding, BusFinding):
         use = (_how_to_use(finding.bus, chip) for chip in finding.chips)
         return "\n".join((str(finding), *(f"  use it: {text}" for text in use if text))) + "\n"
@@ -80,8 +80,8 @@ def describe(finding: Found, device: str) -> str:
 
 
 def _how_to_use(bus: str, chip: Chip) -> str:
-    """Keys of the configuration for a chip; empty for what is none of ours."""
-    name = chip.name.lower().rpartition(" ")[2]  # one of two that look alike will do
+    """Returns the configuration keys for a converter; empty for other devices."""
+    name = chip.name.lower().rpartition(" ")[2]  # either of two indistinguishable types works
     where = f"{name}@{chip.address:#04x}"
     if chip.usable:
         return f'photodiode.bus = "{bus}", photodiode.converter = "{where}"'
@@ -89,7 +89,7 @@ def _how_to_use(bus: str, chip: Chip) -> str:
 
 
 def as_dict(finding: Found) -> dict[str, object]:
-    """The same for programs. Angles in degrees, ranges in m, times in s; keys are absent where nothing is known."""
+    """Returns a finding as a dict. Angles in degrees, ranges in m, times in s; unknown keys are absent."""
     if isinstance(finding, BusFinding):
         return _bus_as_dict(finding)
     if finding.error is not None:

@@ -1,7 +1,7 @@
-"""`lumiloop replay LOG --out DIR`: a log through the daemon's own pipeline, as fast as it goes, results as files.
+"""`lumiloop replay LOG --out DIR`: replays a log through the daemon's own pipeline and writes the results as files.
 
-Two replays of one log write identical bytes; what was measured with a watch stands apart, in ``timing.json``. Whatever
-stops a replay early, an unreadable part of the log or a person, what has been computed until then is written.
+Two replays of one log write identical bytes; measured durations are separate, in ``timing.json``. If an unreadable part
+of the log or the user stops a replay early, the results until then are written.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from daemon.system import console
 from estimator.paper import LUMILOOP
 from hal.errors import HalError
 
-if TYPE_CHECKING:  # loaded only where somebody asks for matches
+if TYPE_CHECKING:  # loaded only if matches are requested
     from daemon.replay.match_journal import MatchJournal
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command's body; returns the exit code."""
+    """Runs the command; returns the exit code."""
     if args.journal is None and args.journal_at is None:
         return command(args, write_all, method=args.method)
     from daemon.replay import match_journal
@@ -43,7 +43,7 @@ def command(
     journal: MatchJournal | None = None,
     method: str = LUMILOOP,
 ) -> int:
-    """Replay ``args.log``, let ``write`` put results into ``args.out``, and say how it went; returns the exit code."""
+    """Replays ``args.log``, lets ``write`` put results into ``args.out``, reports, and returns the exit code."""
     try:
         folder = Folder(args.out)
         keys = tuple(override.partition("=")[0].strip() for override in args.set)
@@ -61,7 +61,7 @@ def _code(outcome: Outcome) -> int:
 
 
 def _verdict(outcome: Outcome) -> int:
-    """Last words on stderr, and the exit code: a replay without a pose has failed."""
+    """Prints the summary on stderr and returns the exit code: a replay without a pose has failed."""
     source, rerun = outcome.source, outcome.rerun
     if sys.stderr.isatty():
         sys.stderr.write("\r\x1b[K")

@@ -1,4 +1,4 @@
-"""``lumiloop run``: the daemon of this computer, with what is stored and surveyed, until a signal stops it."""
+"""``lumiloop run``: runs the daemon with the stored map and the survey until a signal stops it."""
 
 from __future__ import annotations
 
@@ -37,9 +37,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ANEW_S: Final = 10.0
-"""Pause before the end of a start that came to nothing: the service manager would start anew after 0.2 s, which is for
-a crash. What was missing (a map, room for kernels or a recording) has not come by then, and each start takes seconds of
-processor time and lines of the log."""
+"""Pause before the end of a failed start, s: the service manager would restart after 0.2 s, which suits a crash.
+What was missing (a map, room for kernels or a recording) is still missing by then. Each start takes seconds of
+processor time and lines of the log.
+"""
 
 SECOND: Final = (
     "what it has open, sensors, ports, maps, this one cannot have; stop it (systemctl stop lumiloop), or give this one "
@@ -48,11 +49,14 @@ SECOND: Final = (
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command ``run``. ``args``: the configuration (``settings``), where to ``record``, how much (``last``)."""
+    """Runs the command.
+
+    ``args``: configuration (``settings``), recording folder (``record``), minutes kept (``last``).
+    """
     start_log()
     settings: Config = args.settings
     log.info("%s: configuration\n%s", settings.name, loader.dump(settings).rstrip())
-    for other in streams_served(settings.name):  # need not be a mistake, but each device has one owner
+    for other in streams_served(settings.name):  # this may be intended, but each device has one owner
         log.warning("a daemon named %s runs on this computer already (%s): %s", settings.name, other, SECOND)
     recorder = None
     give_back()
@@ -76,7 +80,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _wait_before_anew() -> None:
-    """Let the service manager wait where a start came to nothing; a stop ends it (SIGTERM, as its default is)."""
+    """Delays the service manager's restart after a failed start; a stop ends the wait (SIGTERM's default action)."""
     if managed():
         notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=cannot start, see the log; tried again soon")
         log.info("the next start is tried in %.0f s", ANEW_S)
@@ -84,7 +88,7 @@ def _wait_before_anew() -> None:
 
 
 def _environment(settings: Config) -> Environment:
-    """The real one, with what is stored and surveyed of map and lights; raises `SurveyError` and `NoMap`."""
+    """Returns the real environment with the stored map and the survey; raises `SurveyError` and `NoMap`."""
     stream = runtime_folder() / f"{settings.name}.stream"
     if not settings.photodiode.fitted:
         store, start = started(settings.map, None)
@@ -97,7 +101,7 @@ def _environment(settings: Config) -> Environment:
 
 
 def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> str:
-    """One line for the person at the terminal: where the pose can be read, what is kept, how to stop."""
+    """Returns one line for the operator: where the pose is published, what is stored, how to stop."""
     modbus = f"Modbus on {settings.bind} port {settings.modbus.port} (UDP and TCP)"
     said = [modbus if settings.modbus.port else "no Modbus on the network"]
     said += [f"Modbus RTU on {settings.modbus.serial}"] if settings.modbus.serial else []

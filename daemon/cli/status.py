@@ -1,4 +1,4 @@
-"""`lumiloop status`: read a running daemon over Modbus UDP and show it to a person or, as JSON, to a program.
+"""`lumiloop status`: reads a running daemon over Modbus UDP and prints it as a table or as JSON.
 
 Standard library only, so that it starts at once on any computer.
 """
@@ -30,7 +30,7 @@ _CLEAR: Final = "\x1b[H\x1b[2J"
 
 
 def main(args: argparse.Namespace) -> int:
-    """Body of the command; `args` has address, json, watch, and settings (:class:`daemon.config.schema.Config`)."""
+    """Runs the command; `args` has address, json, watch, and settings (:class:`daemon.config.schema.Config`)."""
     try:
         host, port = address_of(args.address, args.settings)
         with Reader(host, port, None if args.address or args.settings is None else args.settings.name) as reader:
@@ -41,7 +41,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def address_of(text: str | None, settings: Config | None) -> tuple[str, int]:
-    """Host and port to read: as named, else where the configuration says that the daemon listens.
+    """Returns host and port to read: as named, else those on which the configured daemon listens.
 
     Raises:
         NoAnswer: not an address.
@@ -99,7 +99,7 @@ def _show(reading: Reading, as_json: bool, stalled: bool, who: Whose, on_screen:
 
 
 def _fitted(text: str) -> str:
-    """What a terminal has room for: the state, which stands first, is not to scroll away."""
+    """Returns the lines that fit into the terminal: the state, which comes first, must not scroll away."""
     size = shutil.get_terminal_size()
     lines, room = [line[: size.columns] for line in text.splitlines()], max(2, size.lines - 1)
     if len(lines) > room:

@@ -1,4 +1,4 @@
-"""A reading of the published block for a person, as a table, and for a program, as an object."""
+"""Status as a table for the operator, and as an object for a program, from the published registers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _GUESS: Final = "  (a guess: the place is not known)"
 
 
 def as_object(reading: Reading, stalled: bool) -> dict[str, Any]:
-    """The reading with its codes and bits spelled out."""
+    """Returns the reading with its codes and bits spelled out."""
     spelled = {
         "state": _state(reading["state"]),
         "reason_text": _meaning("reason", reading["reason"]),
@@ -40,7 +40,7 @@ def _fix(reading: Reading) -> str | None:
 
 
 def _links(reading: Reading) -> Iterator[dict[str, Any]]:
-    """Every link in view, strongest first."""
+    """Yields every listed link, largest RSS first."""
     for row in range(1, LISTED_LINKS + 1):
         if (code := reading[f"link_{row}_code"]) is not None:
             link = {name: reading[f"link_{row}_{name}"] for name in ("lamp", "use", "strength", "residual")}
@@ -48,9 +48,9 @@ def _links(reading: Reading) -> Iterator[dict[str, Any]]:
 
 
 def as_table(reading: Reading, stalled: bool) -> str:
-    """The reading for a person: one line a subject."""
+    """Returns the reading as a table: one line a subject."""
     flags = registers.decode_bits(registers.FLAGS, reading["flags"])
-    starting = reading["state"] == State.STARTING  # no cycle yet: nothing is published anew, no device judged
+    starting = reading["state"] == State.STARTING  # no cycle yet: there are no new snapshots, and devices have no state
     still = "  (STANDS STILL: no new snapshot)" if stalled and not starting else ""
     rows = [
         ("state", _state(reading["state"]) + still),
@@ -76,13 +76,13 @@ def as_table(reading: Reading, stalled: bool) -> str:
 
 
 def _more_faults(reading: Reading) -> list[tuple[str, str]]:
-    """Faults beside the gravest."""
+    """Returns the rows of the faults beside the gravest."""
     numbers = [reading.get(f"fault_{k}") for k in range(2, parts_block.FAULTS + 1)]
     return [("", _meaning("fault", number)) for number in numbers if number]
 
 
 def _parts(reading: Reading) -> list[tuple[str, str]]:
-    """For how long it runs, what had to be restarted, what is down or hangs."""
+    """Returns the row of uptime, restarts, and components that are down or hang."""
     if "uptime" not in reading:
         return []
     counts = {part.name: reading[f"restarts_{part.name.lower()}"] for part in parts_block.PARTS}
@@ -106,7 +106,7 @@ def _name(table: type[IntEnum], number: Value) -> str:
 
 
 def _meaning(subject: str, number: Value) -> str:
-    """What a reason or fault number means and what to do; the tables are loaded only when there is one to explain."""
+    """Returns meaning and remedy of a reason or fault number; the tables are loaded only when needed."""
     if not number:
         return "none"
     from daemon.health.faults import FAULTS
@@ -122,9 +122,9 @@ def _number(value: Value, unit: str, digits: int = 4) -> str:
 
 
 def _bounded(value: Value, unit: str) -> str:
-    """An age, a sigma or a speed; a register at its largest value says that much or more.
+    """Returns an age, a sigma or a speed; a register at its largest value means that value or more.
 
-    Speeds have a coarser step and never read as just that.
+    Speeds have a coarser step and never read as exactly that value.
     """
     return f"> {math.floor(10.0 * _TOP) / 10.0} {unit}" if value is not None and value >= _TOP else _number(value, unit)
 
@@ -141,7 +141,7 @@ def _triple(reading: Reading, names: tuple[str, str, str], unit: str, per: str) 
 
 
 def _left_out(reading: Reading) -> str:
-    """How long cycles take, what they leave out, and when they stood still, as far as it is known and worth a word."""
+    """Returns cycle times, degradation level and stalls, where they are known and notable."""
     long, rung, stalls = reading.get("cycle_p99"), int(reading.get("rung") or 0), reading.get("stalls")
     said = f", 99 of 100 within {_number(long, 's', 5)}" if long is not None else ""
     said += f"; {timing_block.RUNGS[rung]}" if 0 < rung < len(timing_block.RUNGS) else ""
@@ -153,7 +153,7 @@ def _left_out(reading: Reading) -> str:
 
 
 def _trust(reading: Reading) -> list[tuple[str, str]]:
-    """The bound on the error, what it rests on, and whether it is above the limit that is set."""
+    """Returns the rows of the protection level, its solutions, the alert limit and the number of hypotheses."""
     if "witnesses" not in reading:
         return []
     bits = registers.decode_bits(integrity_block.WITNESSES, reading["witnesses"])
@@ -170,7 +170,7 @@ def _trust(reading: Reading) -> list[tuple[str, str]]:
 
 
 def _lights(reading: Reading) -> list[tuple[str, str]]:
-    """How many lamps, what lights alone say, and a line for every link."""
+    """Returns the rows of the lamps in view, the light solution, and every link."""
     if reading["links"] is None:
         return [("lights", "no photodiode configured")]
     strongest = reading["light_id"]
@@ -206,7 +206,7 @@ def _unknown_axes(flags: dict[str, bool]) -> str:
 
 
 def _reserve(state: Value, flags: dict[str, bool]) -> str:
-    """What has to be known of a pose before it is used."""
+    """Returns what must be known of a pose before it is used."""
     return _GUESS if state in GUESSED and flags["pose_valid"] else _unknown_axes(flags)
 
 

@@ -1,4 +1,4 @@
-"""`lumiloop survey REC`: a light survey from a recorded drive, in the frame of the drive's map."""
+"""`lumiloop survey REC`: estimates a light survey from a recorded drive, in the frame of the drive's map."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hal.errors import HalError
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command's body; returns the exit code."""
+    """Runs the command; returns the exit code."""
     if args.out.exists() and not args.force:
         return console.fail(
             f"{args.out} exists: name another file with --out, or ask for it to be replaced with --force"
@@ -41,7 +41,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def report(found: Surveyed, height: float | None) -> str:
-    """All of it for people."""
+    """Returns the results as text."""
     lines = [
         f"{'lamp':>6} {'code':>5} {'x m':>8} {'y m':>8} {'z m':>6} {'sigma m':>8} {'power W':>8} {'nearest m':>10}"
     ]
@@ -57,6 +57,6 @@ def report(found: Surveyed, height: float | None) -> str:
 
 
 def remarks(found: Surveyed) -> dict[int, str]:
-    """Behind each lamp: how well it is placed, and how near the drive came."""
+    """Returns a comment for each lamp: its sigmas, and the smallest distance of the drive."""
     rows = zip(found.found.survey.lamps, found.sigma, found.nearest, strict=True)
     return {lamp.lamp_id: f"x +-{s[0]:.3f}, y +-{s[1]:.3f} m, passed at {near:.1f} m" for lamp, s, near in rows}

@@ -1,7 +1,7 @@
-"""Commands that listen to a running daemon's local stream, or need a library of their own: words and options.
+"""Parsers of the commands that attach to a running daemon's stream, or need a library of their own.
 
-Their bodies are in the room `taps`, which is loaded only when one of them runs; what it needs beyond the core is an
-extra of the package, and who lacks it is told which.
+Most of their bodies are in `taps`, which is loaded only when one of them runs. What they need beyond the core is an
+extra of the package; if it is missing, the command names it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from daemon.cli.command_body import config_arguments, estimating, later, listeni
 
 Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse has no public name for it
 MOST_DOMAIN = 232
-"""The ports of a larger one would be beyond 65535 (DDS)."""
+"""Largest ROS domain; the ports of a larger one would be beyond 65535 (DDS)."""
 
 
 def add(commands: Commands[argparse.ArgumentParser]) -> None:
-    """Add them all."""
+    """Adds all these commands."""
     _export(commands.add_parser("export", help="write a recording as MCAP (ROS 2, Foxglove), TUM or KITTI"))
     _record_mcap(commands.add_parser("record-mcap", help="record a running daemon as MCAP, until interrupted"))
     _view(commands.add_parser("view", help="show a running daemon, or a recording, as a web page"))
@@ -93,7 +93,7 @@ def _fleet(parser: argparse.ArgumentParser) -> None:
     router.set_defaults(body=needing("zenoh", "taps.fleet.share", "router"))
     for verb in (join, share, fetch, router):
         _meeting(verb)
-        for option in verb._actions:  # argparse has no other way: what was said before the verb counts
+        for option in verb._actions:  # argparse has no other way to keep options given before the verb
             if option.dest in ("router", "zenoh", "config", "set", "print_config"):
                 option.default = argparse.SUPPRESS
 
@@ -106,7 +106,7 @@ def _meeting(parser: argparse.ArgumentParser) -> None:
 
 
 def _shared(text: str) -> str:
-    if text not in ("survey", "map"):  # argparse's own `choices` have no way to say that none is allowed, too
+    if text not in ("survey", "map"):  # argparse's own `choices` cannot also permit none
         raise argparse.ArgumentTypeError(f"{text}: name survey, map, or none for both")
     return text
 

@@ -1,4 +1,4 @@
-"""``lumiloop warm``: compile the kernels that a start with this configuration will need, so that it need not."""
+"""``lumiloop warm``: compiles the kernels that a start with this configuration needs."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command ``warm``; ``args.settings`` says whether there is a photodiode.
+    """Runs the command ``warm``; ``args.settings`` determines whether there is a photodiode.
 
-    Where an earlier start has compiled all of it nothing is loaded: the daemon, which waits for this at every boot,
-    loads it itself.
+    If an earlier start has compiled everything, nothing is loaded. The daemon waits for this command at every boot and
+    then loads the kernels itself.
     """
     settings: Config = args.settings
     try:
@@ -36,7 +36,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _lights(settings: Config) -> Lights | None:
-    """What the configuration says of them; where it says nothing, numpy is not loaded to learn that."""
+    """Returns the configured light setup; without one, numpy is not loaded."""
     if not (settings.photodiode.fitted or settings.lights.survey):
         return None
     from daemon.devices.light_setup import load_lights

@@ -1,7 +1,7 @@
-"""`lumiloop why TIME`: replays what the flight recorder holds around a moment, and says why it was as it was.
+"""`lumiloop why TIME`: replays the flight recorder's data around a moment, and reports state, reason and evidence.
 
-The recording is found by `daemon/diagnosis/recorded_spans.py`; text and picture are `moment_report.py` and
-`moment_plot.py` there.
+`daemon/diagnosis/recorded_spans.py` finds the recording; `moment_report.py` and `moment_plot.py` there make text and
+plot.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from daemon.system.extras import how_to_install
 from hal.errors import HalError
 
 FLIGHT: Final = "flight"
-"""Folder below the state directory, ours or else the service's, where recordings are looked for if none is named."""
+"""Folder of recordings if none is named, below our state directory or else the service's."""
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command's body; ``args``: the ``time`` as it was typed, ``log`` or None, where to draw (``out``) or None."""
+    """Runs the command; ``args``: the ``time`` as typed, ``log`` or None, plot file (``out``) or None."""
     folder = args.log or recordings_folder(FLIGHT)
     try:
         if args.log is None and not is_folder(folder):
@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _try(out: Path) -> None:
-    """Whether a picture can be drawn, and put there: known before anything is replayed; raises `OutputRefused`."""
+    """Checks before the replay that a plot can be made and written; raises `OutputRefused`."""
     if find_spec("matplotlib") is None:
         raise OutputRefused(f"pictures need matplotlib: {how_to_install('plot')}")
     Folder(out.parent).demand(out.name)

@@ -1,1 +1,1 @@
-"""Setting up a building: lamp planning before, calibration and survey by drive after the lamps hang."""
+"""Commissioning of a building: lamp planning before installation; calibration and survey by a drive after it."""

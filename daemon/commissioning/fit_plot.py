@@ -1,4 +1,4 @@
-"""Pictures of calibrations and of a survey by drive; they need matplotlib, which is an extra."""
+"""Plots of a calibration and of a survey by drive; they need matplotlib, which is an extra."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MISSING: Final = f"no picture: matplotlib is not installed ({how_to_install('pl
 
 
 def draw_calibration(found: Calibrated, path: Path) -> str:
-    """Residuals before and after, over the distance from each lamp; returns what to tell the user."""
+    """Plots residuals before and after, over the distance from each lamp; returns a line for the user."""
     canvas = _canvas((9.0, 4.5))
     if canvas is None:
         return _MISSING
@@ -34,7 +34,7 @@ def draw_calibration(found: Calibrated, path: Path) -> str:
 
 
 def draw_survey(result: Surveyed, path: Path) -> str:
-    """Lamps with their uncertainties over the way driven; returns what to tell the user."""
+    """Plots the lamps with their sigmas over the trajectory driven; returns a line for the user."""
     canvas = _canvas((7.0, 7.0))
     if canvas is None:
         return _MISSING
@@ -49,7 +49,7 @@ def draw_survey(result: Surveyed, path: Path) -> str:
 
 
 def draw_wheels(fit: WheelFit, path: Path) -> str:
-    """Wheels against laser, step by step, before and after; returns what to tell the user."""
+    """Plots odometry minus lidar, step by step, before and after; returns a line for the user."""
     canvas = _canvas((9.0, 6.0))
     if canvas is None:
         return _MISSING
@@ -70,7 +70,7 @@ def draw_wheels(fit: WheelFit, path: Path) -> str:
 
 
 def _canvas(inches: tuple[float, float]) -> Any:
-    """An empty figure, None without matplotlib."""
+    """Returns an empty figure; None without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError:

@@ -1,4 +1,4 @@
-"""A floor plan as a planner needs it: what is solid, where a robot can be, where a lamp can hang."""
+"""Floor plan for lamp planning: walls, robot positions, and possible lamp positions."""
 
 from __future__ import annotations
 
@@ -17,29 +17,30 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 CELL_M: Final = 0.1
-"""Of the plan; finer pictures are made coarser."""
+"""Cell of the plan, m; finer images are made coarser."""
 CLEARANCE_M: Final = 0.3
-"""A robot's middle keeps so far from walls."""
+"""Distance of the robot's centre from walls, m."""
 FURNITURE_M: Final = 1.5
-"""What stands alone and is no longer than this does not reach the ceiling: light passes over it."""
+"""Longest isolated object, m, that does not reach the ceiling: light passes over it."""
 LEAST_AREA_M2: Final = 1.0
-"""Free spots smaller than this are flaws of the picture."""
+"""Smaller free areas, m^2, are flaws of the image."""
 MOST_PLACES: Final = 5000
 FINEST_M: Final = 0.25
 
 
 class NoHall(Exception):
-    """The plan cannot be used; the text says why, and what to do."""
+    """The plan cannot be used; the text gives cause and remedy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hall:
-    """Rows are from below, in the plan's own frame, whose corner and turn in the map frame are ``origin``.
+    """Floor plan with rows from below, in its own frame; ``origin`` is the pose of its corner in the map frame.
 
     Attributes:
-        origin: (x, y, yaw), m and rad. cell: m. solid: stops a laser. tall: stops light, too.
-        places: (n, 2) m in the plan's frame, where a robot can be, on a grid of ``step`` m. spots: (m, 2), where lamps
-            can hang.
+        origin: (x, y, yaw), m and rad. cell: m. solid: stops the lidar. tall: stops light, too.
+        places: (n, 2) m in the plan's frame, positions of a robot on a grid of ``step`` m. spots: (m, 2) m, possible
+        lamp
+            positions.
     """
 
     origin: tuple[float, float, float]
@@ -51,19 +52,19 @@ class Hall:
     spots: Array
 
     def in_map(self, xy: Array) -> Array:
-        """Points of the plan's frame in the map frame."""
+        """Transforms points (n, 2), m, from the plan's frame to the map frame."""
         x, y, yaw = self.origin
         c, s = math.cos(yaw), math.sin(yaw)
         return np.column_stack((x + c * xy[:, 0] - s * xy[:, 1], y + s * xy[:, 0] + c * xy[:, 1]))
 
 
 def read_hall(path: Path, spacing: float) -> Hall:
-    """The plan in a picture of map_server's (its YAML file, or the picture beside it), or in a map file.
+    """Returns the plan in an image of map_server or in a map file.
 
-    ``spacing`` is between spots for lamps, m.
+    ``path``: YAML file, the image beside it, or a map file. ``spacing``: between possible lamp positions, m.
 
     Raises:
-        NoHall: it cannot be used.
+        NoHall: the plan cannot be used.
     """
     if path.suffix == ".lumimap":
         return hall_of(*_of_map(path), spacing)
@@ -98,10 +99,10 @@ def _of_map(path: Path) -> tuple[Trinary, float, tuple[float, float, float]]:
 
 
 def hall_of(cells: Trinary, resolution: float, origin: tuple[float, float, float], spacing: float) -> Hall:
-    """The plan that cells (1 occupied, 0 free, -1 unknown; rows from below) make.
+    """Returns the plan of a grid of cells (1 occupied, 0 free, -1 unknown; rows from below).
 
     Raises:
-        NoHall: there is no place for a robot in it.
+        NoHall: it has no place for a robot.
     """
     solid, free, cell = _coarser(cells, resolution)
     room = ndimage.distance_transform_edt(free) * cell > CLEARANCE_M
@@ -120,7 +121,10 @@ def hall_of(cells: Trinary, resolution: float, origin: tuple[float, float, float
 
 
 def _coarser(cells: Trinary, resolution: float) -> tuple[Mask, Mask, float]:
-    """Solid and free at some :data:`CELL_M`: a block is solid if anything in it is, free if half of it is known so."""
+    """Returns solid and free masks at about :data:`CELL_M`, and the cell size, m.
+
+    A block is solid if any cell in it is. It is free if at least half of its cells are known to be free.
+    """
     k = max(1, round(CELL_M / resolution))
     rows, columns = -(-cells.shape[0] // k), -(-cells.shape[1] // k)
     padded = np.full((rows * k, columns * k), -1, np.int8)
@@ -132,7 +136,7 @@ def _coarser(cells: Trinary, resolution: float) -> tuple[Mask, Mask, float]:
 
 
 def _tall(solid: Mask, cell: float) -> Mask:
-    """Without what is no wall: small things that stand alone."""
+    """Returns the solid mask without small isolated objects, which are no walls."""
     labels, _ = ndimage.label(solid, structure=np.ones((3, 3)))
     tall = solid.copy()
     for number, where in enumerate(ndimage.find_objects(labels), 1):
@@ -142,7 +146,7 @@ def _tall(solid: Mask, cell: float) -> Mask:
 
 
 def _on_grid(mask: Mask, cell: float, step: float) -> Array:
-    """Middles of cells of the mask, ``step`` apart; a part that the grid misses has its middle-most cell."""
+    """Returns centres of mask cells on a grid of ``step`` m; a mask that the grid misses gives its first cell."""
     k = max(1, round(step / cell))
     chosen = np.zeros_like(mask)
     chosen[k // 2 :: k, k // 2 :: k] = mask[k // 2 :: k, k // 2 :: k]
@@ -153,7 +157,10 @@ def _on_grid(mask: Mask, cell: float, step: float) -> Array:
 
 
 def clear(blocked: Mask, cell: float, start: Array, ends: Array) -> Mask:
-    """(n,) whether the straight way from ``start`` (2,) to each of ``ends`` (n, 2) crosses nothing that is blocked."""
+    """Returns (n,) whether the straight line from ``start`` (2,) to each of ``ends`` (n, 2) crosses no blocked cell.
+
+    M.
+    """
     if not len(ends):
         return np.zeros(0, np.bool_)
     longest = float(np.hypot(*(ends - start).T).max())

@@ -1,8 +1,8 @@
-"""Where lamps go: one after the other where they tell most (greedy D-optimal design), until the goals are met.
+"""Lamp placement by greedy D-optimal design: adds the most informative lamp until the goals are met.
 
-The worth of a set of lamps is a sum over places of the logarithm of the determinant of what laser and light tell, and
-of how many of the wanted links there are. Both grow ever more slowly with every lamp, so that greedy choice comes
-within 63 % of the best there is (Nemhauser, Wolsey, Fisher 1978), and a spot's worth of before is a bound on it now.
+The worth of a set of lamps is a sum over places. It adds the log-determinant of the information by lidar and light, and
+the number of wanted links present. Both grow more slowly with every lamp. Greedy selection therefore comes within 63 %
+of the optimum (Nemhauser, Wolsey, Fisher 1978). The earlier gain of a position is an upper bound of its present gain.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from daemon.commissioning.floor import Array, Hall
 from daemon.commissioning.light_information import Fitting, Seen, information, seen_from, worst
 
 PRIOR: Final = 1.0 / 0.5**2
-"""Information of a robot that knows its place to half a metre on each axis."""
+"""Prior information of a robot with a sigma of half a metre on each axis, 1/m^2."""
 WALLS_MOST: Final = 1.0 / 0.05**2
-"""More than that the laser is not trusted: light is to be a witness of its own."""
+"""Upper limit of the lidar's information, 1/m^2: light must be an independent solution."""
 LINK_WORTH: Final = 0.7
-"""Of a further link where there are too few, against the determinant's logarithm."""
+"""Worth of a further link where there are too few, in units of the log-determinant."""
 
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """When there are enough lamps.
+    """Goals that end the selection.
 
     Attributes:
-        links: that a place should see. accuracy: deviation from light alone, m, that a place should have.
-        share: of the places for which both must hold. most: lamps, at most; exact: as many, whatever the goals say.
+        links: wanted at a place. accuracy: wanted sigma by light alone, m.
+        share: of the places at which both must hold. most: limit of lamps; exact: number of lamps, whatever the goals.
     """
 
     links: int = 4
@@ -44,12 +44,12 @@ class Goals:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """Chosen lamps and what comes of them.
+    """Selected lamps and their effect.
 
     Attributes:
-        lamps: (k, 2) in the plan's frame. links: (n,) seen from each place. light: (n, 3) information of light,
-            walls: of the laser. reached: share of the places where both goals hold.
-        possible: (n,) whether the goals could hold there with a lamp at every spot.
+        lamps: (k, 2) in the plan's frame, m. links: (n,) at each place. light: (n, 3) information by light, 1/m^2;
+            walls: by the lidar. reached: share of the places where both goals hold.
+        possible: (n,) whether the goals could hold there with a lamp at every possible position.
     """
 
     lamps: Array
@@ -60,7 +60,7 @@ class Plan:
     possible: npt.NDArray[np.bool_]
 
     def short_of(self, goals: Goals) -> str:
-        """Why the goals are not reached where they could be, or there are fewer lamps than asked; else empty."""
+        """Returns why the goals are not reached where they could be, or why lamps are missing; empty otherwise."""
         count = len(self.lamps)
         if goals.exact is not None:
             return "" if count >= goals.exact else f"only {count} spots where one more lamp would tell anything"
@@ -72,17 +72,17 @@ class Plan:
 
     @property
     def light_sigma(self) -> Array:
-        """(n,) m, of the worse axis, from light alone."""
+        """(n,) sigma of the worse axis by light alone, m."""
         return worst(self.light)[0]
 
     @property
     def sigma(self) -> Array:
-        """(n,) m, of the worse axis, from laser and light."""
+        """(n,) sigma of the worse axis by lidar and light, m."""
         return worst(self.light + self.walls)[0]
 
 
 class _Sum:
-    """What all chosen lamps tell every place."""
+    """Information and links of all selected lamps at every place."""
 
     def __init__(self, count: int, walls: Array, goals: Goals) -> None:
         self.told = np.zeros((count, 6))
@@ -94,19 +94,19 @@ class _Sum:
         self._now = self._worth(np.arange(count), self.told, self.links)
 
     def add(self, seen: Seen, sign: int = 1) -> None:
-        """Hang one more (or take it away)."""
+        """Adds one lamp (``sign`` -1: removes it)."""
         at = seen.places
         self.told[at] += sign * seen.told
         self.links[at] += sign
         self._now[at] = self._worth(at, self.told[at], self.links[at])
 
     def gain(self, seen: Seen) -> float:
-        """By how much one more would raise the worth."""
+        """Returns the increase of the worth by one more lamp."""
         at = seen.places
         return float((self._worth(at, self.told[at] + seen.told, self.links[at] + 1) - self._now[at]).sum())
 
     def met(self) -> npt.NDArray[np.bool_]:
-        """Places where both goals hold."""
+        """Returns the mask (n,) of places where both goals hold."""
         sigma, _ = worst(information(self.told))
         return np.asarray((self.links >= self.goals.links) & (sigma <= self.goals.accuracy))
 
@@ -117,7 +117,7 @@ class _Sum:
 
 
 def choose(hall: Hall, fitting: Fitting, walls: Array, goals: Goals) -> Plan:
-    """Lamps for a hall."""
+    """Selects lamps for a floor plan."""
     spots = [seen_from(hall, fitting, spot) for spot in hall.spots]
     everywhere = _Sum(len(hall.places), walls, goals)
     for seen in spots:
@@ -138,7 +138,7 @@ def choose(hall: Hall, fitting: Fitting, walls: Array, goals: Goals) -> Plan:
 
 
 def plan_of(hall: Hall, fitting: Fitting, walls: Array, goals: Goals, lamps: Array) -> Plan:
-    """What comes of lamps that hang already, (k, 2) in the plan's frame."""
+    """Returns the effect of installed lamps, (k, 2) m in the plan's frame."""
     total = _Sum(len(hall.places), walls, goals)
     for lamp in lamps:
         total.add(seen_from(hall, fitting, lamp))
@@ -176,7 +176,7 @@ def _greedy(total: _Sum, spots: Sequence[Seen], possible: npt.NDArray[np.bool_])
 def _without_needless(
     total: _Sum, spots: Sequence[Seen], chosen: list[int], possible: npt.NDArray[np.bool_]
 ) -> list[int]:
-    """Take away, the oldest first, what the goals do not need: later lamps have made some early ones superfluous."""
+    """Removes lamps that the goals do not need, the oldest first: later lamps make some early ones superfluous."""
     kept = list(chosen)
     for index in chosen:
         if not _enough(total, possible, 0):
@@ -190,7 +190,10 @@ def _without_needless(
 
 
 def codes_for(lamps: Array, count: int) -> tuple[list[int], float]:
-    """A code of ``count`` for each of the lamps (k, 2), and the least distance of two of one code, m or infinite."""
+    """Assigns one of ``count`` codes to each lamp (k, 2).
+
+    Also returns the least distance of two equal codes, m or infinite.
+    """
     given: list[int] = []
     least = float("inf")
     for index, lamp in enumerate(lamps):

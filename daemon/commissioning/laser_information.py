@@ -1,7 +1,7 @@
-"""What the laser alone learns of the position at a place: Fisher information of ranges to walls (Censi, ICRA 2007).
+"""Lidar information on the position at a place: Fisher information of ranges to walls (Censi, ICRA 2007).
 
-A beam that meets a wall with normal n tells the position along n. Neighbouring beams share their errors, and so do a
-wall and its map: a beam counts :data:`BEAM_SIGMA_M`, so that three that agree make an axis known, and one does not.
+A beam that meets a wall with normal n measures the position along n. Neighbouring beams have common errors, and so do a
+wall and its map. A beam therefore counts with :data:`BEAM_SIGMA_M`: three that agree make an axis known, one does not.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ BEAMS: Final = 120
 REACH_M: Final = 10.0
 BEAM_SIGMA_M: Final = 0.15
 KNOWN_SIGMA_M: Final = 0.10
-"""An axis with a larger deviation is blind, as `estimator.result.KNOWN` has it."""
+"""An axis with a larger sigma, m, is not known; the same as `estimator.result.KNOWN`."""
 STEEPEST: Final = 0.3
-"""Beams that graze a wall by less (cosine to its normal) tell nothing that can be relied on."""
+"""Smallest usable cosine between a beam and a wall's normal; beams that graze a wall more are unreliable."""
 _FINE_CELLS, _COARSE_CELLS = 0.7, 1.5
 _CHUNK: Final = 400
 
 
 def wall_information(hall: Hall, reach: float = REACH_M) -> Array:
-    """(n, 3) xx, xy, yy at every place."""
+    """Returns the information (n, 3) xx, xy, yy at every place, 1/m^2."""
     nx, ny = _normals(hall)
     angle = np.linspace(-math.pi, math.pi, BEAMS, endpoint=False)
     ux, uy = np.cos(angle), np.sin(angle)
@@ -45,7 +45,7 @@ def wall_information(hall: Hall, reach: float = REACH_M) -> Array:
 
 
 def _normals(hall: Hall) -> tuple[Array, Array]:
-    """Unit normals of what is solid, up to their sign, by its structure tensor: a thin wall has them, too."""
+    """Returns unit normals of solid cells, up to their sign, by the structure tensor, which suits thin walls too."""
     smooth = ndimage.gaussian_filter(hall.solid.astype(np.float64), _FINE_CELLS)
     gy, gx = np.gradient(smooth)
     xx, xy, yy = (ndimage.gaussian_filter(part, _COARSE_CELLS) for part in (gx * gx, gx * gy, gy * gy))
@@ -54,7 +54,7 @@ def _normals(hall: Hall) -> tuple[Array, Array]:
 
 
 def _cast(hall: Hall, places: Array, ux: Array, uy: Array, reach: float) -> tuple[Index, Index, Mask]:
-    """First solid cell along each beam: rows, columns (p, beams), and whether there was one."""
+    """Returns the first solid cell along each beam: rows, columns (p, beams), and whether there was one."""
     x, y = places[:, :1] / hall.cell, places[:, 1:] / hall.cell
     rows, columns = hall.solid.shape
     row, column = (np.zeros((len(places), len(ux)), np.int64) for _ in range(2))

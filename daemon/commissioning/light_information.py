@@ -1,9 +1,9 @@
-"""What a place learns of its position from each lamp it sees: Eq. 1 and its derivative, with what is not known of it.
+"""Light information on the position at a place, from each received lamp: Eq. 1, its derivative, and its uncertainties.
 
-ln of a received strength has, for level lamp and receiver, the gradient -(m_t + m_r + 2) (p - l) / d^2 (Eq. 7), and the
-variance of `estimator.paper.lateration_model.usable`: the lamp's own power, the lean of ceiling and robot, light by way
-of walls. What all links share, the receiver's gain, is taken out by the Sherman-Morrison formula, so that what lamps
-tell a place adds up.
+Lamp and receiver are level. The gradient of ln of the RSS is then -(m_t + m_r + 2) (p - l) / d^2 (Eq. 7). Its variance
+is that of `estimator.paper.lateration_model.usable`. It contains the lamp's own power, the tilt of ceiling and robot,
+and light by way of walls. All links share the receiver's gain. The Sherman-Morrison formula eliminates it, so that the
+information of lamps at a place adds up.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ import numpy.typing as npt
 from daemon.commissioning.floor import Array, Hall, clear
 
 SHARED_LN, TILT, BY_WALLS = 0.05, 0.015, 0.008
-"""As in `lateration_model.Doubt`: gain that all links share, lean (rad), diffuse part of its own."""
+"""As in `lateration_model.Doubt`: common gain of all links, tilt (rad), and the lamp's own diffuse part."""
 RIM: Final = 0.97
-"""Part of the cone's radius in which a lamp counts: at its edge a robot that leans loses it."""
+"""Share of the radius of the field of view in which a lamp counts: at its edge a tilted robot loses the lamp."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fitting:
-    """What kind of lamp and receiver.
+    """Parameters of lamp and receiver.
 
     Attributes:
         height: of lamps above the receiver, m. order: Lambert order of the lamps plus that of the receiver.
-        half_fov: of the receiver, rad. sigma_ln: of a lamp's power, one sigma.
+        half_fov: of the receiver, rad. sigma_ln: sigma of ln of a lamp's power.
     """
 
     height: float
@@ -39,20 +39,20 @@ class Fitting:
 
     @property
     def reach(self) -> float:
-        """Horizontal metres within which a lamp is received."""
+        """Horizontal distance within which a lamp is received, m."""
         return RIM * self.height * math.tan(min(self.half_fov, math.radians(85.0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """The places that see a lamp: their indices (k,), and what each learns (k, 6): w (gx^2, gx gy, gy^2, gx, gy, 1)."""
+    """Places that receive a lamp: indices (k,), and information terms (k, 6): w (gx^2, gx gy, gy^2, gx, gy, 1)."""
 
     places: npt.NDArray[np.int64]
     told: Array
 
 
 def seen_from(hall: Hall, fitting: Fitting, spot: Array) -> Seen:
-    """The places that see a lamp at ``spot`` (2,)."""
+    """Returns the places that receive a lamp at ``spot`` (2,), m."""
     off = hall.places - spot
     near = np.flatnonzero(np.einsum("ij,ij->i", off, off) < fitting.reach**2)
     near = near[clear(hall.tall, hall.cell, spot, hall.places[near])]
@@ -60,7 +60,7 @@ def seen_from(hall: Hall, fitting: Fitting, spot: Array) -> Seen:
 
 
 def told(fitting: Fitting, off: Array) -> Array:
-    """What places at ``off`` (k, 2) from right below a lamp learn of it; see :class:`Seen`."""
+    """Returns the information terms of a lamp at offsets ``off`` (k, 2), m, from its nadir; see :class:`Seen`."""
     h, e = fitting.height, fitting.order + 2.0
     range2 = np.einsum("ij,ij->i", off, off)
     d2 = range2 + h * h
@@ -72,7 +72,7 @@ def told(fitting: Fitting, off: Array) -> Array:
 
 
 def information(total: Array) -> Array:
-    """(n, 3) Fisher information xx, xy, yy of places whose lamps told ``total`` (n, 6)."""
+    """Returns the Fisher information (n, 3) xx, xy, yy, 1/m^2, of summed terms ``total`` (n, 6)."""
     share = 1.0 / SHARED_LN**2 + total[:, 5]
     bx, by = total[:, 3], total[:, 4]
     return np.column_stack(
@@ -81,7 +81,7 @@ def information(total: Array) -> Array:
 
 
 def worst(info: Array) -> tuple[Array, Array]:
-    """Largest deviation (n,) m of places with this information, infinite where it is none, and its direction, rad."""
+    """Returns the largest sigma (n,), m, infinite without information, and its direction, rad."""
     xx, xy, yy = info.T
     middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     least = np.maximum(middle - half, 0.0)

@@ -1,4 +1,4 @@
-"""Calibration of odometry and laser mount from a drive, and its findings as text and configuration."""
+"""Calibration of odometry and lidar mount from a drive, and its findings as text and configuration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MOUNT: Final = (Wheel.MOUNT_X, Wheel.MOUNT_Y, Wheel.MOUNT_YAW)
 
 
 def findings(fit: WheelFit, odometry: bool, mount: bool) -> list[str]:
-    """What the drive told of what was asked for, for people."""
+    """Returns the requested results of the fit as text lines."""
     pair = [f"{1e3 * way:.1f} mm {_deg(turn):.3f} deg" for way, turn in (fit.before, fit.after)]
     lines = [f"{fit.steps} steps; wheels against laser, rms: {pair[0]} before, {pair[1]} after"]
     if odometry:
@@ -28,7 +28,7 @@ def findings(fit: WheelFit, odometry: bool, mount: bool) -> list[str]:
 
 
 def with_mount(config: Config, fit: WheelFit) -> Config:
-    """The same configuration with the laser where the drive found it."""
+    """Returns the configuration with the fitted lidar mount."""
     x, y, yaw = fit.value[Wheel.MOUNT_X :]
     place = replace(
         config.lidar.mount, x=_rounded(x, 4), y=_rounded(y, 4), yaw=_rounded(math.remainder(_deg(yaw), 360.0), 3)
@@ -41,13 +41,13 @@ def _rounded(value: float, decimals: int) -> float:
 
 
 def configuration_lines(config: Config) -> list[str]:
-    """The mount as lines of the configuration file."""
+    """Returns the mount as lines of the configuration file."""
     mount = config.lidar.mount
     return ["", "[lidar.mount]", f"x = {mount.x:.4f}", f"y = {mount.y:.4f}", f"yaw = {mount.yaw:.3f}", ""]
 
 
 def fit_drive(drive: Drive) -> WheelFit:
-    """Wheels against laser over the whole drive; raises `DataInvalid`."""
+    """Fits odometry to the lidar poses over the whole drive; raises `DataInvalid`."""
     if len(drive.readings) < 2:
         raise DataInvalid(str(drive.path), "no odometry in it", "record with odometry.port set and readings sent to it")
     stamps, first = np.unique(drive.readings[:, 0], return_index=True)

@@ -1,4 +1,4 @@
-"""The picture of a plan: how many lamps each place sees, how well it knows itself, and which axes are blind."""
+"""Plot of a lamp plan: links at each place, sigma by light alone, and axes that are not known."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from daemon.commissioning.laser_information import KNOWN_SIGMA_M
 from daemon.commissioning.light_information import worst
 
 _LYING: Final = 0.4
-"""Floors that are longer than high by more than that lie one below the other."""
+"""Smallest ratio of height to width at which the three panels stand side by side; flatter floors are stacked."""
 _PANEL_IN: Final = 11.0
-"""Longest side of one of the three where it is tall, or lies."""
+"""Longest side of a panel, inches, where the floor is tall or the panels are stacked."""
 _WIDE_IN: Final = 4.2
 _LEAST_IN: Final = 2.2
 _STAR_M: Final = 0.9
@@ -25,7 +25,7 @@ _WORST_CM: Final = 25.0
 
 
 def draw(hall: Hall, plan: Plan) -> bytes | None:
-    """PNG; None without matplotlib."""
+    """Returns a PNG; None without matplotlib."""
     if find_spec("matplotlib") is None:
         return None
     from matplotlib.figure import Figure
@@ -50,7 +50,7 @@ def draw(hall: Hall, plan: Plan) -> bytes | None:
 
 
 class Window(NamedTuple):
-    """The part of the plan that holds anything of the floor, m in its frame."""
+    """Drawn part of the plan, m in the plan's frame."""
 
     left: float
     below: float
@@ -65,14 +65,14 @@ def _window(hall: Hall, plan: Plan) -> Window:
 
 
 def _panel(window: Window) -> tuple[float, float]:
-    """Width and height of one of the three, inches."""
+    """Returns width and height of one panel, inches."""
     ratio = window.height / window.width
     wide = min(_WIDE_IN, _PANEL_IN / ratio) if ratio >= _LYING else _PANEL_IN
     return wide, wide * ratio
 
 
 def _inches(window: Window, upright: bool) -> tuple[float, float]:
-    """Width and height of a picture that the three fill."""
+    """Returns width and height of the whole figure, inches."""
     wide, high = _panel(window)
     if upright:
         return 3.0 * (max(wide, _LEAST_IN) + 0.8), max(high, _LEAST_IN) + 1.4
@@ -84,7 +84,7 @@ def _points_per_m(window: Window) -> float:
 
 
 def _lamps(axes: Any, plan: Plan, window: Window) -> None:
-    """Stars, small enough to leave something to be seen between them."""
+    """Plots the lamps as stars, small enough to leave the plan visible."""
     size = float(np.clip(_STAR_M * _points_per_m(window), 3.0, 9.0))
     axes.plot(*plan.lamps.T, "*", color="black", markerfacecolor="gold", markersize=size, markeredgewidth=0.1 * size)
 
@@ -100,9 +100,10 @@ def _walls(axes: Any, hall: Hall, window: Window) -> None:
 
 
 def _gridded(hall: Hall, value: Array) -> tuple[tuple[float, float, float, float], Array]:
-    """Left, right, lower, upper edge in m, and the places' values (n,) as rows from below; not a number between them.
+    """Returns left, right, lower and upper edge in m, and the places' values (n,) as rows from below; NaN between them.
 
-    One square a place, side by side in the plan's own metres: markers have a size on the paper, and leave gaps.
+    One square per place, side by side in the plan's own metres; markers would have a fixed size on paper and leave
+    gaps.
     """
     low = hall.places.min(axis=0)
     column, row = np.rint((hall.places - low) / hall.step).astype(np.int64).T
@@ -126,7 +127,7 @@ def _places(
 
 
 def _axes(axes: Any, hall: Hall, plan: Plan, window: Window) -> None:
-    """Lines along the axis that is not known: by the laser alone, and with lamps."""
+    """Plots lines along the axes that are not known: by the lidar alone, and with lamps."""
     _walls(axes, hall, window)
     for info, colour, label in (
         (plan.walls, "tab:orange", "laser alone"),

@@ -1,7 +1,8 @@
-"""A recorded teach drive: where the robot was, by laser alone, and what it received of each lamp there.
+"""Recorded teach drive: poses by the lidar alone, and the RSS of each lamp at these poses.
 
-The poses are those of a replay without lights, as the map stands at its end: what is to be calibrated has no part in
-them. The light is decoded once more from the recorded blocks, as far as a computer without a robot to drive can afford.
+The poses are those of a replay without lights, by the final map. The calibrated quantities therefore do not affect
+them. The light is decoded again from the recorded blocks. A computer without a robot to drive permits more effort for
+that than a cycle.
 """
 
 from __future__ import annotations
@@ -27,20 +28,20 @@ from hal.errors import DataInvalid, HalError
 from hal.odometry import RawOdometry
 
 SEARCH_CODES: Final = 2000
-"""Effort per block; a replay has no cycle to keep."""
+"""Codes searched per block; a replay has no cycle to keep."""
 GAP_S: Final = 0.3
-"""A strength between two poses farther apart than this has no place."""
+"""Largest gap between two poses, s; an RSS in a larger gap has no position."""
 
 
 @dataclass(slots=True, eq=False)
 class Drive:
-    """What a recording holds.
+    """Content of a recording.
 
     Attributes:
-        path: of the recording. poses: T_map_base by laser, with stamps. survey: as it was when recorded.
-        epochs: decoded, with stamps of their middles on the same clock.
-        readings: of the wheels, (n, 4) stamp, x, y, yaw.
-        config: the recording's, or the one that was asked for.
+        path: of the recording. poses: T_map_base by the lidar, with stamps. survey: as it was when recorded.
+        epochs: decoded, with stamps of their middles on the same clock, s.
+        readings: of the odometry, (n, 4) stamp, x, y, yaw (s, m, m, rad).
+        config: the recording's, or the requested one.
         profile: air interface of the light, None without a photodiode.
         stopped: why reading ended early, empty otherwise.
     """
@@ -56,16 +57,16 @@ class Drive:
 
     @property
     def mount(self) -> Array:
-        """(3,) x, y, yaw of the laser on the robot, as the poses were computed with; m and rad."""
+        """(3,) x, y, yaw of the lidar on the robot, with which the poses were computed; m and rad."""
         mount = self.config.lidar.mount
         return np.array((mount.x, mount.y, np.radians(mount.yaw)))
 
 
 def read_drive(path: Path, settings: Config, given: Given) -> Drive:
-    """Replay a recording for its poses and decode its light.
+    """Replays a recording for its poses and decodes its light.
 
     Raises:
-        HalError: it cannot be opened, has no scans, or what it says of lights is not of this version.
+        HalError: it cannot be opened, has no scans, or its light setup is not of this version.
     """
     source = open_log(path)
     used = config_for(source, settings, given)
@@ -102,10 +103,10 @@ def _check(source: Source, drive: Drive) -> None:
 
 
 def heard(drive: Drive) -> Heard:
-    """Every strength that was received plainly, at the pose of its instant.
+    """Returns every RSS without a flag, at the pose of its instant.
 
     Raises:
-        DataInvalid: no light at all was decoded.
+        DataInvalid: no light was decoded.
     """
     parts = [part for stamp, epoch in drive.epochs for part in _strengths(stamp, epoch)]
     if not parts:
@@ -120,7 +121,7 @@ def heard(drive: Drive) -> Heard:
 
 
 def _strengths(stamp: float, epoch: LightEpoch) -> Iterator[tuple[float, ...]]:
-    """Stamp, code, amplitude, sigma of its ln and lamp ID (-1: unknown) of each link without a flag."""
+    """Yields stamp, code, amplitude, sigma of its ln, and lamp ID (-1: unknown) of each link without a flag."""
     if epoch.block & UNUSABLE:
         return
     columns = (epoch.ids.tolist(), epoch.amplitude.tolist(), epoch.variance.tolist(), epoch.flags.tolist())
@@ -130,7 +131,7 @@ def _strengths(stamp: float, epoch: LightEpoch) -> Iterator[tuple[float, ...]]:
 
 
 def poses_at(trajectory: Trajectory, t: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Poses (n, 3) at stamps, between those there are; and (n,) whether there are poses near enough."""
+    """Returns poses (n, 3) interpolated at ``t`` (n,), s, and (n,) whether the poses on both sides are near enough."""
     order = np.argsort(trajectory.stamps, kind="stable")
     stamps, poses = trajectory.stamps[order], trajectory.poses[order]
     yaw = np.unwrap(poses[:, 2])
@@ -141,10 +142,10 @@ def poses_at(trajectory: Trajectory, t: Array) -> tuple[Array, npt.NDArray[np.bo
 
 
 def rows_for(survey: Survey, strengths: Heard, T_survey_drive: Array) -> Rows:
-    """Rows of the survey's lamps: by the number a lamp said, else by code and the nearest such lamp.
+    """Returns the rows of the survey's lamps: matched by the received lamp ID, else by code and the nearest such lamp.
 
-    ``rows.lamp`` counts the survey's lamps; poses stay in the drive's frame. Strengths of codes that the survey does
-    not know are left out.
+    ``rows.lamp`` is the index in the survey; poses stay in the drive's frame. An RSS with a code outside the survey is
+    omitted.
     """
     x, y, yaw = T_survey_drive
     c, s = np.cos(yaw), np.sin(yaw)

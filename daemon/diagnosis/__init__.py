@@ -1,1 +1,1 @@
-"""What is wrong with an installation, and why a recorded moment was as it was."""
+"""Diagnosis: checks of an installation, ageing of lamps, and reports on a recorded moment."""

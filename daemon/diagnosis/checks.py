@@ -1,4 +1,4 @@
-"""Every check: what is asked, and what follows from the answer. In the order in which one would mend things."""
+"""Checks of `lumiloop doctor`: each examines one part of the installation; listed in the order of repair."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from daemon.snapshot import LinkUse, State
 from hal.net.inet import refusal
 
 FREE_BYTES: Final = 200 << 20
-"""A map of a large building, twice, and some recording."""
+"""Required free room, bytes: a map of a large building, twice, and some recording."""
 FIRST_UTC: Final = 1_735_689_600.0
-"""2025: a computer whose calendar says less has no clock of its own and has not been told the time."""
+"""Start of 2025, s of UTC: an earlier calendar means that the clock was never set."""
 GROUPS: Final = {"i2c": "i2c", "tty": "dialout"}
 
 
 class Level(IntEnum):
-    """How bad it is."""
+    """Severity of a finding."""
 
     GOOD = 0
     REMARK = 1
@@ -39,7 +39,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What one check has found: about what, how bad, what, and what to do (empty where there is nothing to do)."""
+    """Result of one check: subject, severity, text, and remedy (empty if none is needed)."""
 
     about: str
     level: Level
@@ -49,11 +49,11 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is looked at.
+    """Input of the checks.
 
     Attributes:
-        settings: the configuration. file: where it is from, None: built-in. host: the computer.
-        heard: what the running daemon tells; `Mute`: it is there and is not heard; a text: why there is none.
+        settings: the configuration. file: its path, None: built-in values. host: the computer.
+        heard: data from the running daemon; `Mute`: a daemon without readable data; a text: why there is none.
     """
 
     settings: Config
@@ -63,7 +63,7 @@ class Case:
 
     @property
     def runs(self) -> bool:
-        """Whether a daemon of this name is running: its devices and ports are in use then."""
+        """True if a daemon of this name is running; its devices and ports are then in use."""
         return isinstance(self.heard, Heard | Mute)
 
 
@@ -71,22 +71,22 @@ Check = Callable[[Case], Iterator[Finding]]
 
 
 def good(about: str, text: str) -> Finding:
-    """All is well."""
+    """Returns a finding without a defect."""
     return Finding(about, Level.GOOD, text)
 
 
 def remark(about: str, text: str, remedy: str = "") -> Finding:
-    """It works, and it is worth knowing."""
+    """Returns a finding that works but needs attention."""
     return Finding(about, Level.REMARK, text, remedy)
 
 
 def fix(about: str, text: str, remedy: str) -> Finding:
-    """It does not work as it is."""
+    """Returns a finding that must be repaired."""
     return Finding(about, Level.FIX, text, remedy)
 
 
 def configuration(case: Case) -> Iterator[Finding]:
-    """A file that cannot be read ends the doctor before this."""
+    """Checks the configuration; an unreadable file ends the doctor before this check."""
     about = "configuration"
     if case.file is None:
         yield remark(about, "none named: built-in values are looked at", "name the daemon's: --config FILE")
@@ -97,7 +97,7 @@ def configuration(case: Case) -> Iterator[Finding]:
 
 
 def clock(case: Case) -> Iterator[Finding]:
-    """Poses carry UTC; the estimate itself does not need it."""
+    """Checks the calendar: poses carry UTC, but the estimate itself does not need it."""
     if case.host.utc() < FIRST_UTC:
         yield fix(
             "clock", "the calendar says a year before 2025", "set it, or start a time service: timedatectl set-ntp true"
@@ -111,7 +111,7 @@ def clock(case: Case) -> Iterator[Finding]:
 
 
 def cache(case: Case) -> Iterator[Finding]:
-    """Compiled kernels."""
+    """Checks for compiled kernels."""
     try:
         warm = case.host.warm(case.settings.photodiode.fitted)
     except (OSError, RuntimeError) as error:
@@ -125,7 +125,7 @@ def cache(case: Case) -> Iterator[Finding]:
 
 
 def disk(case: Case) -> Iterator[Finding]:
-    """Room for maps and recordings."""
+    """Checks the room for maps and recordings."""
     for folder in filter(can_be_made, {_maps(case.settings) or state_folder(), state_folder()}):
         free = case.host.free_bytes(folder)
         if free < FREE_BYTES:
@@ -136,12 +136,12 @@ def disk(case: Case) -> Iterator[Finding]:
 
 
 def lidar(case: Case) -> Iterator[Finding]:
-    """The laser: there, ours to open, and a HOKUYO."""
+    """Checks the lidar: present, accessible, and a HOKUYO."""
     if not case.settings.lidar.fitted:
         yield good("lidar", "none is configured")
         return
     if case.runs:
-        return  # it is in use; the daemon's own faults tell
+        return  # it is in use; the daemon's own faults cover it
     device = case.settings.lidar.place.device
     named = [device] if device != AUTO else case.host.lidars()
     if not named:
@@ -168,7 +168,7 @@ def _lidar_at(name: str, case: Case) -> Finding:
 
 
 def photodiode(case: Case) -> Iterator[Finding]:
-    """Its bus, and its converter on it."""
+    """Checks the bus of the photodiode, and the converter on it."""
     settings = case.settings.photodiode
     if not settings.fitted:
         yield good("photodiode", "none is configured")
@@ -196,7 +196,7 @@ def photodiode(case: Case) -> Iterator[Finding]:
 
 
 def _unusable(about: str, device: str, host: Host) -> Finding | None:
-    """Why a device's file cannot be opened; None: it can, or has no file."""
+    """Returns why a device file cannot be opened; None if it can, or if there is no file."""
     if not device.startswith("/"):
         return None
     if not host.exists(device):
@@ -210,7 +210,7 @@ def _unusable(about: str, device: str, host: Host) -> Finding | None:
 
 
 def ports(case: Case) -> Iterator[Finding]:
-    """Where servers are to listen."""
+    """Checks the ports on which servers listen."""
     settings = case.settings
     wanted: list[tuple[str, socket.SocketKind, int]] = []
     if settings.modbus.port:
@@ -236,14 +236,14 @@ def ports(case: Case) -> Iterator[Finding]:
 
 
 def rtu(case: Case) -> Iterator[Finding]:
-    """The serial line for Modbus."""
+    """Checks the serial line for Modbus."""
     line = case.settings.modbus.line
     if line is not None and not case.runs:
         yield _unusable("modbus", line.path, case.host) or good("modbus", f"{line.path} can be opened")
 
 
 def receivers(case: Case) -> Iterator[Finding]:
-    """Hosts that pose datagrams are sent to."""
+    """Checks the host names that receive pose datagrams."""
     for receiver in case.settings.pose.receivers:
         host, _ = parse_endpoint(receiver)
         if host != ANYBODY and (why := case.host.resolved(host)):
@@ -252,7 +252,7 @@ def receivers(case: Case) -> Iterator[Finding]:
 
 
 def maps(case: Case) -> Iterator[Finding]:
-    """The folder of maps, and the map to begin with."""
+    """Checks the map folder and the initial map."""
     settings = case.settings
     if not settings.map.kept:
         yield remark("maps", "are not kept: `map.folder` is none")
@@ -273,7 +273,7 @@ def _maps(settings: Config) -> Path | None:
 
 
 def survey(case: Case) -> Iterator[Finding]:
-    """The lamps' file."""
+    """Checks the survey file of the lamps."""
     from daemon.devices.photodiode import profile_of
 
     settings = case.settings
@@ -297,7 +297,7 @@ def survey(case: Case) -> Iterator[Finding]:
 
 
 def daemon(case: Case) -> Iterator[Finding]:
-    """What the running daemon says itself: state, and all faults with their remedies."""
+    """Reports state and faults of the running daemon, with their remedies."""
     heard = case.heard
     if isinstance(heard, str):
         yield remark(
@@ -330,7 +330,7 @@ _ODD: Final = {
 
 
 def lamps(case: Case) -> Iterator[Finding]:
-    """Lights seen against the survey; needs the daemon."""
+    """Compares the received lamps with the survey; needs the daemon."""
     if not case.settings.photodiode.fitted:
         return
     if not isinstance(case.heard, Heard):
@@ -355,7 +355,7 @@ def lamps(case: Case) -> Iterator[Finding]:
 
 
 def realtime(case: Case) -> Iterator[Finding]:
-    """The right to go before others."""
+    """Checks the permission for real-time priority."""
     if case.runs:
         return
     if case.host.realtime():
@@ -366,7 +366,7 @@ def realtime(case: Case) -> Iterator[Finding]:
 
 
 def sockets(case: Case) -> Iterator[Finding]:
-    """The folder of the local stream."""
+    """Checks the folder of the local stream."""
     folder = runtime_folder()
     if not case.runs and case.host.exists(str(folder)) and not case.host.usable(str(folder)):
         remedy = "start it as the user whose folder it is, or set RUNTIME_DIRECTORY"

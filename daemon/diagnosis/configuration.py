@@ -1,4 +1,4 @@
-"""What is wrong with, or remarkable about, a configuration and what it names: survey, maps, the photodiode's bus."""
+"""Plausibility check of a configuration and of what it names: survey, maps, and the photodiode's bus."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from daemon.diagnosis.map_folder import Maps, look_at_maps
 from daemon.system import console
 
 FAR_M: Final = 5.0
-"""A lidar is on its robot."""
+"""Largest plausible distance of a lidar from the robot's centre, m."""
 
 
 def examine(settings: Config, file: Path, gone: frozenset[str], wrong: list[tuple[int, str]]) -> list[str]:
-    """What is remarked of a configuration and of what it names; what is wrong joins ``wrong``, with an exit code.
+    """Returns the remarks on a configuration and on what it names; defects are added to ``wrong`` with an exit code.
 
-    ``gone``: keys whose values are not to be had; what hangs on them is not judged.
+    ``gone``: keys without a valid value; nothing that depends on them is checked.
     """
     remarks = implausible(settings.lidar.mount)
     if settings.lights.survey:
@@ -36,7 +36,7 @@ def examine(settings: Config, file: Path, gone: frozenset[str], wrong: list[tupl
 
 
 def _look_at_survey(settings: Config, profile: str | None, file: Path, wrong: list[tuple[int, str]]) -> list[str]:
-    """Likewise of the survey; ``profile`` of its lamps, None: not known."""
+    """Checks the survey in the same way; ``profile``: air interface of its lamps, None: not known."""
     from daemon.config.survey_loader import SurveyError, read_survey
     from daemon.devices.light_setup import read_residuals
     from estimator import PROFILES
@@ -53,7 +53,7 @@ def _look_at_survey(settings: Config, profile: str | None, file: Path, wrong: li
 
 
 def implausible(mount: Mount) -> list[str]:
-    """What of a mount may be meant in other units."""
+    """Returns remarks on mount values that may be in other units."""
     said = [
         f"`lidar.mount.{axis}` = {metres:g}: metres from the robot's centre; is that meant?"
         for axis, metres in (("x", mount.x), ("y", mount.y))
@@ -66,7 +66,7 @@ def implausible(mount: Mount) -> list[str]:
 
 
 def _look_at_bus(name: str) -> str:
-    """One line about the photodiode's bus, which is opened and closed again."""
+    """Opens and closes the photodiode's bus; returns one line about it."""
     import asyncio
 
     from hal.bus.opening import open_bus

@@ -1,4 +1,4 @@
-"""The host that the checks query: the computer, its devices, and a running daemon. Tests replace it."""
+"""Host interface of the checks: the computer, its devices, and a running daemon. Tests replace it."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from hal.port.opening import open_port
 
 LISTEN_S: Final = 3.0
 LISTENERS: Final = "lumiloop-stream"
-"""The group that may listen to the service."""
+"""Group with access to the service's stream."""
 TIME_ERROR: Final = 5
-"""adjtimex(2): the clock is not synchronised."""
+"""Result of adjtimex(2) for a clock that is not synchronised."""
 _TIMEX_BYTES: Final = 512  # more than struct timex on any architecture
 
 
 @dataclass(slots=True)
 class Heard:
-    """What a running daemon has told: latest pose, faults, and every lamp with what it was last used for.
+    """Data received from a running daemon: latest pose, faults, and the last use of every lamp.
 
     ``lamps``: (code, lamp ID or None) to the use, as `daemon.snapshot.LinkUse` numbers it.
     """
@@ -50,18 +50,21 @@ class Heard:
 
 
 SAID_AS: Final[dict[int, int]] = {LinkUse.MISSING: Fault.LAMP_DEAD, LinkUse.REJECTED: Fault.LAMP_MOVED}
-"""The fault that a running daemon has when a lamp has been so for long (`daemon.integrity.lamp_monitor`)."""
+"""Fault that a running daemon raises once a lamp has had this use for long (`daemon.integrity.lamp_monitor`)."""
 
 
 def standing(heard: Heard) -> Callable[[int], bool]:
-    """Whether what a lamp is used for is more than a passing shadow: dead or moved only where the faults say so."""
+    """Returns a test for a lasting use of a lamp.
+
+    A dead or moved lamp needs the fault; otherwise it may be a passing shadow.
+    """
     present = set() if heard.faults is None else {one.fault for one in heard.faults.present}
     return lambda use: use not in SAID_AS or SAID_AS[use] in present
 
 
 @dataclass(frozen=True, slots=True)
 class Mute:
-    """A daemon that is there and is not heard: why, and what to do."""
+    """A running daemon without readable data: cause and remedy."""
 
     text: str
     remedy: str
@@ -71,11 +74,11 @@ class Host:
     """The computer that the program runs on."""
 
     def utc(self) -> float:
-        """Seconds since the Unix epoch, by the calendar of the computer."""
+        """Calendar time of the computer, s since the Unix epoch."""
         return time.time()
 
     def synchronised(self) -> bool | None:
-        """Whether the calendar follows a time server; None where the system does not say."""
+        """True if the calendar follows a time server; None if the system does not report it."""
         try:
             state = int(ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
         except (OSError, AttributeError):
@@ -83,7 +86,7 @@ class Host:
         return None if state < 0 else state != TIME_ERROR
 
     def user(self) -> str:
-        """Who we are."""
+        """Name of the present user, or the number without a name."""
         import pwd
 
         try:
@@ -92,15 +95,15 @@ class Host:
             return str(os.geteuid())
 
     def exists(self, path: str) -> bool:
-        """Whether there is something at a path."""
+        """True if the path exists."""
         return Path(path).exists()
 
     def usable(self, path: str) -> bool:
-        """Whether it may be read and written by us."""
+        """True if the present user may read and write the path."""
         return os.access(path, os.R_OK | os.W_OK)
 
     def lidars(self) -> list[str]:
-        """Ports at which a HOKUYO may be."""
+        """Ports that may have a HOKUYO."""
         return discover.candidates()
 
     def buses(self) -> list[str]:
@@ -108,21 +111,21 @@ class Host:
         return list(i2c_linux.buses())
 
     def lidar_at(self, device: str) -> Finding:
-        """Who is at a port."""
+        """Identifies the device at a port."""
         return asyncio.run(identify_at(open_port, device))
 
     def chips_on(self, bus: str) -> BusFinding:
-        """What answers on a bus."""
+        """Returns the devices that respond on a bus."""
         return asyncio.run(probe_bus(open_bus, bus))
 
     def free_bytes(self, folder: Path) -> int:
-        """Room on the disk that a folder, or what there is of the way to it, is on."""
+        """Free room, bytes, on the disk of a folder or of its nearest existing parent."""
         while not folder.exists() and folder != folder.parent:
             folder = folder.parent
         return shutil.disk_usage(folder).free
 
     def resolved(self, host: str) -> str:
-        """Why a name stands for no address; empty: it does, or is one."""
+        """Returns why a host name has no address; empty if it has one, or is one."""
         try:
             socket.getaddrinfo(host, None)
         except OSError as error:
@@ -130,7 +133,7 @@ class Host:
         return ""
 
     def taken(self, kind: socket.SocketKind, host: str, port: int) -> OSError | None:
-        """Why a server could not listen there; None: it could."""
+        """Returns why a server could not listen there; None if it could."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.socket(family, kind) as sock:
             if kind is socket.SOCK_STREAM:
@@ -142,26 +145,26 @@ class Host:
         return None
 
     def warm(self, lights: bool) -> bool:
-        """Whether the kernels of this version have been compiled here.
+        """True if the kernels of this version have been compiled here.
 
         Raises:
-            OSError, RuntimeError: there is nowhere to keep them.
+            OSError, RuntimeError: there is no folder for them.
         """
         from daemon.runtime.warmup import is_marked
 
         return is_marked("warm-lights" if lights else "warm")
 
     def realtime(self) -> bool:
-        """Whether we may take a real-time priority."""
+        """True if the present user may set a real-time priority."""
         return os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] > 0
 
     def listen(self, path: Path) -> Heard | Mute | str:
-        """What a running daemon tells for some seconds; a text: why there is none."""
+        """Receives the stream of a running daemon for some seconds; a text: why there is none."""
         heard = asyncio.run(_listen(path))
         return heard if isinstance(heard, Heard) else self._mute(path, heard) or heard
 
     def _mute(self, path: Path, why: str) -> Mute | None:
-        """The daemon at a path that has told nothing; None: there is none."""
+        """Returns the daemon at a path that has sent no data; None if there is none."""
         try:
             _reach(path)
         except PermissionError:

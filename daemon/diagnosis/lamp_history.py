@@ -1,7 +1,7 @@
-"""How strong each lamp was, day by day: learned by the daemon, kept in its maps, gathered into a file that lasts.
+"""Lamp history: gain of each lamp day by day, collected from the daemon's maps into a file that lasts for years.
 
-Maps are few, and are replaced by newer ones; one line a lamp and day is kept here for years. The file is text: UTC in
-seconds, lamp ID, ln of the power against the survey, its deviation.
+Maps are few, and newer ones replace them; this file keeps one line per lamp and day. It is text: UTC in seconds, lamp
+ID, ln of the power over the surveyed power, and its sigma.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ DAY_S: Final = 86_400.0
 KEPT_S: Final = 5 * 365 * DAY_S
 HEAD: Final = "utc,lamp,ln_gain,sigma\n"
 DIGITS: Final = 5
-"""Of what is kept, behind the point."""
+"""Decimals of the stored values."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Look:
-    """What was known of a lamp at a time: ``ln_gain`` of its power against the survey, ``sigma`` of that."""
+    """Gain of a lamp at a time: ``utc`` in s, ``ln_gain`` of its power over the surveyed one, and its ``sigma``."""
 
     utc: float
     lamp: int
@@ -37,14 +37,14 @@ class Look:
 
 
 class BadHistory(Exception):
-    """The file cannot be read; the text says where, and what to do."""
+    """The file cannot be read; the text gives the line and the remedy."""
 
 
 def load(path: Path) -> list[Look]:
-    """All that is kept, oldest first; empty where there is no file.
+    """Returns all entries, oldest first; empty without a file.
 
     Raises:
-        BadHistory: it is no such file.
+        BadHistory: it is not a lamp history.
         OSError: it cannot be read.
     """
     if not path.exists():
@@ -66,13 +66,13 @@ def load(path: Path) -> list[Look]:
 
 
 def save(path: Path, looks: Iterable[Look]) -> None:
-    """Write it whole or not at all; raises `OSError`."""
+    """Writes the file, whole or not at all; raises `OSError`."""
     lines = [f"{look.utc:.0f},{look.lamp},{look.ln_gain:.{DIGITS}f},{look.sigma:.{DIGITS}f}\n" for look in looks]
     write_whole(path, (HEAD + "".join(lines)).encode())
 
 
 def in_maps(folder: Path) -> list[Look]:
-    """What the maps in a folder say; one that cannot be used is passed over, `lumiloop map verify` says why.
+    """Returns the entries of the maps in a folder, without unusable maps (`lumiloop map verify` gives the cause).
 
     Raises:
         OSError: the folder cannot be read.
@@ -84,7 +84,7 @@ def in_maps(folder: Path) -> list[Look]:
         except (BadMap, OSError):
             continue
         if stored.meta.saved <= 0.0:
-            continue  # its computer did not know the time
+            continue  # the clock of its computer was not set
         gains = stored.tables["gain"]
         for lamp, row in zip(stored.tables["gain.id"].tolist(), gains.tolist(), strict=True):
             looks.append(_as_kept(stored.meta.saved, int(lamp), row[0], math.sqrt(row[3])))
@@ -92,12 +92,12 @@ def in_maps(folder: Path) -> list[Look]:
 
 
 def _as_kept(utc: float, lamp: int, ln_gain: float, sigma: float) -> Look:
-    """As the file has it, to the last digit: a value that stands still must not seem to move by being rounded."""
+    """Returns an entry rounded as in the file, so that rounding does not make a constant value change."""
     return Look(float(round(utc)), lamp, round(ln_gain, DIGITS), max(round(sigma, DIGITS), 10.0**-DIGITS))
 
 
 def merged(kept: Sequence[Look], fresh: Sequence[Look]) -> list[Look]:
-    """Both, the latest of each lamp and day, and not older than :data:`KEPT_S` before the newest."""
+    """Returns the latest entry of each lamp and day, not older than :data:`KEPT_S` before the newest."""
     latest: dict[tuple[int, int], Look] = {}
     for look in sorted((*kept, *fresh)):
         latest[look.lamp, int(look.utc // DAY_S)] = look
@@ -106,6 +106,6 @@ def merged(kept: Sequence[Look], fresh: Sequence[Look]) -> list[Look]:
 
 
 def by_lamp(looks: Sequence[Look]) -> dict[int, np.ndarray[tuple[int, int], np.dtype[np.float64]]]:
-    """By lamp: rows (utc, ln_gain, sigma), oldest first."""
+    """Returns the rows (utc, ln_gain, sigma) of each lamp, oldest first."""
     lamps = sorted({look.lamp for look in looks})
     return {lamp: np.array([(one.utc, one.ln_gain, one.sigma) for one in looks if one.lamp == lamp]) for lamp in lamps}

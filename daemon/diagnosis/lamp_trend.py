@@ -1,8 +1,8 @@
-"""What a lamp's history says: its level, its trend, and when it will have come down to seven tenths.
+"""Lamp ageing: level, trend and replacement date of each lamp from its gain history.
 
-Seven tenths of the light it had when new is where a lamp's life ends by convention (L70, IES LM-80 and TM-21). The
-trend is a line through ln of the power, weighted by what each look knows; what all lamps have in common is dust on the
-receiver as likely as age, and is said of all.
+By convention a lamp's life ends at seven tenths of its initial light (L70, IES LM-80 and TM-21). The trend is a line
+through ln of the power, weighted by the variance of each entry. A change common to all lamps may be dust on the
+receiver or ageing. It is therefore reported for all together.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ FURTHEST_S: Final = 20 * YEAR_S
 LEAST_SPAN_S: Final = 14 * DAY_S
 LEAST_LOOKS: Final = 4
 SURE: Final = 2.0
-"""Deviations by which a trend has to be told from none."""
+"""Sigmas by which a trend must differ from zero."""
 OWN_SIGMA: Final = 0.01
-"""Of a look, beside what it says itself: people, other lamps switched off, the weather."""
+"""Additional sigma of an entry: people, other lamps switched off, the weather."""
 JUMP, JUMP_SIGMAS = 0.25, 4.0
-"""A change from one look to the next that is no ageing, and by how much it has to stand out."""
+"""Change between two entries, ln, and in sigmas, that is too large for ageing."""
 UNHEARD_S: Final = 7 * DAY_S
-"""A lamp whose value has stood still for so long, while most others' moved, was not received."""
+"""Time without a change, s, while most other lamps' values changed, after which a lamp was not received."""
 
 
 class Finding(Enum):
-    """What is said of a lamp, the gravest first."""
+    """Condition of a lamp, the gravest first."""
 
     DEAD = "is not received where it must be: dead, switched off, or covered"
     MOVED = "does not shine as surveyed: moved, exchanged, or its code in use twice"
@@ -55,12 +55,13 @@ URGENT: Final = (Finding.DEAD, Finding.MOVED, Finding.WORN)
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """On one lamp.
+    """Condition of one lamp.
 
     Attributes:
-        level: of the power that the survey says, now. per_year: relative change, with sigma; None: not known.
-        replace_by, earliest: UTC at which it will have come down to seven tenths, as likely as not, and at the earliest
-            (97 %); None where that is nowhere near. since: UTC of what is said, where it has a time.
+        level: present power over the surveyed one. per_year: relative change, with sigma; None: not known.
+        replace_by, earliest: UTC, s, at which it reaches seven tenths: the expected time, and the earliest (97 %); None
+        if
+            that is far off. since: UTC of the condition, s, where it has a time.
     """
 
     lamp: int
@@ -74,14 +75,14 @@ class Verdict:
 
     @property
     def urgent(self) -> bool:
-        """Whether somebody should go there soon."""
+        """True if the lamp needs attention soon."""
         return self.finding in URGENT
 
 
 def judge(lamps: Mapping[int, Array], now: float, uses: Mapping[int, int] | None = None) -> list[Verdict]:
-    """On every lamp, the gravest first, at ``now`` (UTC).
+    """Returns the condition of every lamp at ``now`` (UTC, s), the gravest first.
 
-    ``lamps`` are histories by lamp ID, rows (utc, ln gain, sigma); ``uses``, what a running daemon uses each for now.
+    ``lamps``: histories by lamp ID, rows (utc, ln gain, sigma). ``uses``: present use of each lamp by a running daemon.
     """
     uses = {} if uses is None else uses
     heard = {lamp: _last_change(rows) for lamp, rows in lamps.items()}
@@ -102,13 +103,13 @@ def judge(lamps: Mapping[int, Array], now: float, uses: Mapping[int, int] | None
 
 
 def together(verdicts: list[Verdict]) -> float | None:
-    """Relative change a year that all lamps have in common (their median); None where too few have a trend."""
+    """Returns the median relative change a year of all lamps; None if too few have a trend."""
     trends = [one.per_year for one in verdicts if one.per_year is not None]
     return float(np.median(trends)) if len(trends) >= LEAST_LOOKS else None
 
 
 def _last_change(rows: Array) -> float:
-    """When its value was last another than before; the first look where it never was."""
+    """Returns the UTC of the last change of the value, s; that of the first entry if it never changed."""
     changed = np.flatnonzero(np.abs(np.diff(rows[:, 1])) > 1e-6)
     return float(rows[changed[-1] + 1 if len(changed) else 0, 0])
 
@@ -135,7 +136,7 @@ def _by_history(lamp: int, rows: Array, now: float) -> Verdict:
 
 
 def _jump(rows: Array) -> int | None:
-    """The look before which the lamp was another; None: there is none."""
+    """Returns the index of the entry after the last jump; None without one."""
     step = np.abs(np.diff(rows[:, 1]))
     doubt = np.hypot(rows[1:, 2], rows[:-1, 2])
     found = np.flatnonzero((step > JUMP) & (step > JUMP_SIGMAS * doubt))
@@ -143,7 +144,7 @@ def _jump(rows: Array) -> int | None:
 
 
 def _line(rows: Array, now: float) -> tuple[float, float, float]:
-    """Ln gain at ``now``, its slope a second, and the slope's deviation: looks share what they know least."""
+    """Returns ln gain at ``now``, its slope per second, and the slope's sigma; residual scatter inflates the sigma."""
     t, y = rows[:, 0] - now, rows[:, 1]
     weight = 1.0 / (rows[:, 2] ** 2 + OWN_SIGMA**2)
     middle = float(np.average(t, weights=weight))

@@ -1,4 +1,4 @@
-"""What a folder of maps is good for; nothing in it is touched."""
+"""Condition of a map folder: usable map, write permission, and lock; nothing in it is changed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LOCKS: Final = Path("/proc/locks")
 
 
 class Maps(Enum):
-    """What a folder of maps is good for."""
+    """Condition of a map folder."""
 
     READY = auto()
     EMPTY = auto()
@@ -26,12 +26,12 @@ class Maps(Enum):
 
 
 def look_at_maps(settings: Config) -> tuple[Maps, str]:
-    """What the folder of maps is good for, and one line about it; nothing in it is touched.
+    """Returns the condition of the map folder and one line about it; nothing in it is changed.
 
-    READY: there is a map to begin with. EMPTY: there is none yet, and maps can be kept. FROZEN: there is one, and what
-    is learned cannot be kept, as it should be. TAKEN: the same for as long as another process keeps its maps there; it
-    may be the very daemon that the configuration is of. BROKEN: there is none that can be used, or none can be kept.
-    What cannot be used is said, each file by itself, by the store's own log. A folder is often another user's.
+    READY: there is a map to begin with. EMPTY: there is none yet, and maps can be stored. FROZEN: there is a map, but
+    changes cannot be stored although they should be. TAKEN: the same while another process holds the folder; that may
+    be the very daemon of this configuration. BROKEN: no map is usable, or none can be stored. The store logs each
+    unusable file. The folder often belongs to another user.
     """
     folder = maps_folder(settings.map.folder)
     if not os.access(folder, os.F_OK):
@@ -43,14 +43,14 @@ def look_at_maps(settings: Config) -> tuple[Maps, str]:
         return Maps.BROKEN, f"{folder}: is no folder, maps cannot be kept; name another in `map.folder`"
     if not os.access(folder, os.R_OK | os.X_OK):
         return Maps.BROKEN, f"{folder}: maps in it cannot be read by this user"
-    from daemon.config.survey_loader import SurveyError  # with it comes numpy, which no other remark needs
+    from daemon.config.survey_loader import SurveyError  # imports numpy, which no other remark needs
     from daemon.devices.light_setup import load_lights
     from daemon.maps.store import LOCK, Store, judge_for, unjudged
 
     store = Store(folder, mend=False)
     try:
         judge = judge_for(load_lights(settings))
-    except SurveyError:  # which is told by itself
+    except SurveyError:  # reported separately
         judge = unjudged
     start = store.load(judge)
     unwritten = not settings.map.localise and not _writable(folder, folder / LOCK)
@@ -68,15 +68,15 @@ def look_at_maps(settings: Config) -> tuple[Maps, str]:
 
 
 def _writable(folder: Path, lock: Path) -> bool:
-    """Whether this user may keep maps in a folder: write into it, and take the lock that is there."""
+    """True if this user may store maps in a folder: write into it, and take the present lock."""
     return os.access(folder, os.W_OK | os.X_OK) and (not lock.exists() or os.access(lock, os.R_OK | os.W_OK))
 
 
 def _keeper(lock: Path) -> str:
-    """Who holds the lock of a folder of maps, in words; empty: nobody."""
+    """Returns the holder of the folder's lock as text; empty if there is none."""
     try:
         with lock.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # and back at once: who starts meanwhile tries again
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # released at once: a starting daemon tries again
     except BlockingIOError:
         about = lock.stat()
         named = f"{os.major(about.st_dev):02x}:{os.minor(about.st_dev):02x}:{about.st_ino}"
@@ -89,4 +89,4 @@ def _keeper(lock: Path) -> str:
             words = line.split()  # 3: FLOCK  ADVISORY  WRITE 1234 08:01:5678 0 EOF
             if "FLOCK" in words and words[-3] == named:
                 return f"process {words[-4]}"
-    return "another process"  # of a container of its own, or on a file system that has other numbers here
+    return "another process"  # in another container, or on a file system with different device numbers

@@ -1,4 +1,4 @@
-"""A replayed cycle with what was published then, and which one is meant by a time that somebody writes."""
+"""A replayed cycle with what was published at that time, and the choice of the cycle for a given time."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from daemon.snapshot import Snapshot, State
 from estimator import StepResult
 
 SECOND_S: Final = 1.0
-"""A time without a fraction, as the journal writes it, is of all that came in this long."""
+"""Duration of a time without a fraction, as in the journal, s."""
 LATE_S: Final = 0.15
-"""The journal has a fault from a heartbeat; it is published within this long, or, of a slow lidar, with the next cycle,
-which may begin up to :data:`SECOND_S` later."""
+"""Longest time from a fault in the journal, written at a heartbeat, to its publication, s. With a slow lidar it is
+published with the next cycle, which may begin up to :data:`SECOND_S` later."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """One cycle as it was replayed, with what was published then.
+    """One replayed cycle, with what was published at that time.
 
     Attributes:
-        utc: when it began, to the microsecond, so that no boundary is judged otherwise than it is printed. state: as it
-            was published then. snapshot, result: of the replay. scan: number of the scan it took. fresh: whether the
-            result is of this cycle. wheels: what wheels and laser told over the last two seconds, None where that
-            cannot be said. dropped: scans that were not taken.
-        told: number of the reason that was published, None in a recording of before reason and faults were kept.
-        faults: numbers of those that were published, gravest first.
+        utc: its start, s, to the microsecond, so that comparisons agree with the printed times. state: as published.
+        snapshot, result: of the replay. scan: number of the consumed scan. fresh: whether the result is of this cycle.
+        wheels: motion by odometry and by lidar over the last two seconds, None if they cannot be compared.
+        dropped: scans that were not consumed.
+        told: number of the published reason, None in older recordings without reason and faults.
+        faults: numbers of the published faults, gravest first.
     """
 
     utc: float
@@ -49,13 +49,13 @@ class Moment:
 
     @property
     def reason(self) -> Reason:
-        """Why the state is what it is: as it was published, where that is known, else as the replay has it."""
+        """Reason of the state: the published one if it is known, else that of the replay."""
         known = self.told if self.told in Reason._value2member_map_ else None
         return Reason(self.snapshot.reason if known is None else known)
 
 
 def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle: Cycle) -> Moment:
-    """A cycle that has just been repeated."""
+    """Returns a cycle that has just been repeated."""
     return Moment(
         utc=round(utc_at_zero + record.t_mono, 6),
         state=State(entry.state),
@@ -72,11 +72,11 @@ def moment_of(utc_at_zero: float, entry: CycleEntry, record: CycleRecord, cycle:
 
 
 class Chosen(NamedTuple):
-    """Which cycle is told.
+    """The reported cycle.
 
     Attributes:
-        cycle: its index. last: that of the last one whose changes are told; of what is no whole second it is ``cycle``.
-        changed: that of a whole second's first change, None where there is none, and of what is no whole second.
+        cycle: its index. last: index of the last cycle whose changes are reported; equal to ``cycle`` if the time is no
+            whole second. changed: index of the first change in a whole second; None without one, and for other times.
     """
 
     cycle: int
@@ -85,27 +85,27 @@ class Chosen(NamedTuple):
 
 
 def clock(utc: float, whole: bool = False) -> str:
-    """Date, local time of day to the millisecond (``whole``: second), and the zone's offset then; ``utc``: s."""
+    """Returns date, local time to the millisecond (``whole``: second), and the zone's offset; ``utc``: s."""
     local = datetime.fromtimestamp(utc, UTC).astimezone()
     fraction = "" if whole else f".{local.microsecond // 1000:03d}"
     return f"{local:%Y-%m-%d %H:%M:%S}{fraction}{local:%z}"
 
 
 def of_day(utc: float) -> str:
-    """Local time of day to the millisecond; ``utc``: s."""
+    """Returns the local time of day to the millisecond; ``utc``: s."""
     return f"{datetime.fromtimestamp(utc, UTC).astimezone():%H:%M:%S.%f}"[:-3]
 
 
 def at(told: Sequence[Moment], utc: float) -> int:
-    """Index of the cycle in force at an instant."""
+    """Returns the index of the cycle in force at an instant."""
     return max((k for k, one in enumerate(told) if one.utc <= utc), default=0)
 
 
 def first_change(told: Sequence[Moment], utc: float, wide: float) -> int | None:
-    """Index of the first cycle of a second in which state, reason or faults are others than before; None: in none.
+    """Returns the index of the first cycle in a second that changes state, reason or faults; None without one.
 
-    What of it is published a moment after it counts where nothing changes in it. The second goes from ``utc`` on for
-    ``wide``, s, which is less where only its end is recorded.
+    Changes that are published a moment after the second count if nothing changes in it. The second lasts from ``utc``
+    for ``wide``, s, which is less if only its end is recorded.
     """
     for k in range(1, _reach(told, end_of(utc, wide)) + 1):
         if told[k].utc >= utc and _key(told[k]) != _key(told[k - 1]):
@@ -114,10 +114,10 @@ def first_change(told: Sequence[Moment], utc: float, wide: float) -> int | None:
 
 
 def chosen(told: Sequence[Moment], utc: float, second: bool, wide: float) -> Chosen:
-    """The cycle that is meant by a time which stands for all from ``utc`` on for ``wide``, s, more than 0.
+    """Returns the cycle for a time that lasts from ``utc`` for ``wide``, s, more than 0.
 
-    Of a whole ``second`` it is that of the first change, else its first; of another time, which may be one that was
-    printed and cut, the last one that had begun before it ends.
+    For a whole ``second`` it is the cycle of the first change, else the first cycle. Another time may be a printed and
+    truncated one: it gives the last cycle that began before the time's end.
     """
     end = end_of(utc, wide)
     if not second:
@@ -130,17 +130,17 @@ def chosen(told: Sequence[Moment], utc: float, second: bool, wide: float) -> Cho
 
 
 def end_of(utc: float, wide: float) -> float:
-    """When a time ends, as exactly as cycles are told: the sum of two numbers is off by parts of a microsecond."""
+    """Returns the end of a time, UTC in s, rounded like the cycles: a floating-point sum is off by parts of a us."""
     return round(utc + wide, 6)
 
 
 def _before(told: Sequence[Moment], end: float) -> int:
-    """Index of the last cycle that had begun before an instant."""
+    """Returns the index of the last cycle that began before an instant."""
     return max((k for k, one in enumerate(told) if one.utc < end), default=0)
 
 
 def _reach(told: Sequence[Moment], end: float) -> int:
-    """Index of the last cycle that publishes what came before ``end``: that which begins next, unless it is far off."""
+    """Returns the last cycle that publishes input from before ``end``: the next one to begin, unless it is far off."""
     last = _before(told, end + LATE_S)
     following = next((k for k, one in enumerate(told) if one.utc >= end), last)
     return max(last, following) if told[following].utc < end + SECOND_S else last
@@ -151,6 +151,6 @@ def _key(one: Moment) -> tuple[State, Reason, tuple[int, ...]]:
 
 
 def faults_changed(before: Moment, one: Moment) -> list[tuple[str, int]]:
-    """What has come (``+``) and gone (``-``) of the published faults between two cycles, gravest first."""
+    """Returns the faults that appeared (``+``) and ended (``-``) between two cycles, gravest first."""
     come = [("+", fault) for fault in one.faults if fault not in before.faults]
     return come + [("-", fault) for fault in before.faults if fault not in one.faults]

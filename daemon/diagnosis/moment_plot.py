@@ -1,4 +1,4 @@
-"""The picture of `lumiloop why`: the place with the way around the moment, and what the witnesses told over time."""
+"""Plot of `lumiloop why`: the trajectory around the moment on the map, and the solutions over time."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from estimator import Array, Grid, se2
 _INCHES: Final = (14.0, 8.0)
 _MARGIN_M: Final = 4.0
 LAST_S: Final = 0.05
-"""How long the last cycle is drawn."""
+"""Duration of the last cycle in the plot, s."""
 LABEL: Final = 0.06
-"""Part of the time shown that a fault's number takes: the next one goes below it."""
+"""Share of the time axis that a fault's number occupies; the next label goes below it."""
 LABELS: Final = 8
-"""Rows of them; where all are taken they begin anew."""
+"""Rows of labels; when all are occupied, the first is used again."""
 COLOURS: Final = {
     State.TRACKING: "tab:green",
     State.MAPPING: "tab:blue",
@@ -36,7 +36,7 @@ COLOURS: Final = {
 
 
 def draw(told: Sequence[Moment], utc: float, grid: Grid, kind: str = "png") -> bytes:
-    """A file of that kind: png, svg or pdf; ``utc``, s: where its time is zero. Wants matplotlib."""
+    """Returns a PNG, SVG or PDF file, by ``kind``; ``utc``, s: zero of its time axis. Needs matplotlib."""
     from matplotlib.figure import Figure
 
     one = told[at(told, utc)]
@@ -60,7 +60,7 @@ def draw(told: Sequence[Moment], utc: float, grid: Grid, kind: str = "png") -> b
 
 
 def _place(axes: Any, told: Sequence[Moment], one: Moment, grid: Grid) -> None:
-    """Map, way in the colours of the state, the robot, what light alone says, and the way the wheels alone tell."""
+    """Plots the map, the trajectory coloured by state, the robot, the light solution, and the motion by odometry."""
     poses = [(moment.state, moment.snapshot.pose) for moment in told if moment.snapshot.pose is not None]
     if not poses:
         axes.set_title("there was no pose")
@@ -86,7 +86,7 @@ def _place(axes: Any, told: Sequence[Moment], one: Moment, grid: Grid) -> None:
 
 
 def _wheel_way(axes: Any, one: Moment) -> None:
-    """Where the wheels say that the robot came from, and where the laser does."""
+    """Plots the robot's earlier position by odometry and by lidar."""
     if one.wheels is None or one.snapshot.pose is None:
         return
     here: Array = np.array(one.snapshot.pose)
@@ -109,13 +109,13 @@ def _lamps(axes: Any, one: Moment) -> None:
 
 
 def _empty(axes: Any, why: str) -> None:
-    """In place of curves without a point."""
+    """Writes a text in place of curves without a point."""
     axes.set_yticks([])
     axes.text(0.5, 0.5, why, ha="center", va="center", transform=axes.transAxes, fontsize=8)
 
 
 def _states(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
-    """Strips: state, axes, scans that came to nothing; and where faults came and went, by their numbers."""
+    """Plots strips of state, unknown axes and failed scan matches, and the changes of faults by number."""
     ends = np.append(seconds[1:], seconds[-1] + LAST_S)
     for moment, begin, end in zip(told, seconds.tolist(), ends.tolist(), strict=True):
         axes.barh(0, end - begin, left=begin, color=COLOURS[moment.state], height=0.8)
@@ -124,7 +124,7 @@ def _states(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
                 axes.barh(axis + 1, end - begin, left=begin, color="tab:red", height=0.8)
         if laser_dissents(moment):
             axes.barh(4, end - begin, left=begin, color="tab:red", height=0.8)
-    free = [-math.inf] * LABELS  # until when each row of labels is taken
+    free = [-math.inf] * LABELS  # time until which each row of labels is occupied
     for (before, moment), begin in zip(pairwise(told), seconds[1:].tolist(), strict=True):
         if not (changed := faults_changed(before, moment)):
             continue
@@ -153,9 +153,9 @@ def _uncertainty(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
 def _two_scales(
     axes: Any, seconds: Array, left: tuple[str, list[float]], right: tuple[str, list[float]], more: Sequence[Any] = ()
 ) -> Any:
-    """A curve to the left axis and one to the right one, which is returned; each has the unit in its name.
+    """Plots one curve on the left axis and one on the right axis, which it returns; each name has its unit.
 
-    ``more``: of the left one, to be named as well.
+    ``more``: further artists of the left axis for the legend.
     """
     other = axes.twinx()
     lines = [*axes.plot(seconds, left[1], "C0", label=left[0]), *other.plot(seconds, right[1], "C1", label=right[0])]
@@ -167,7 +167,10 @@ def _two_scales(
 
 
 def _wheels(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
-    """Nothing where a witness is silent: what it told last is no comparison."""
+    """Plots the separation of odometry and lidar.
+
+    A sensor without data leaves a gap, as its last value is no comparison.
+    """
     both = [None if False in (one.snapshot.odometry_ok, one.snapshot.lidar_ok) else one.wheels for one in told]
     metres = [math.nan if said is None else said.apart[0] for said in both]
     turned = [math.nan if said is None else math.degrees(said.apart[1]) for said in both]
@@ -196,4 +199,4 @@ def _light(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     other = _two_scales(axes, seconds, ("light from pose, m", away), ("in deviations", gap))
     most = math.sqrt(GAP)
     other.axhline(most, color="tab:red", linewidth=0.8)
-    other.set_ylim(0.0, max(other.get_ylim()[1], 1.1 * most))  # how far it is from there is what one looks for
+    other.set_ylim(0.0, max(other.get_ylim()[1], 1.1 * most))  # keep the threshold in view

@@ -1,4 +1,4 @@
-"""Replays a recording around an instant."""
+"""Replay of a recording around an instant."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from daemon.system import console
 
 
 def moments(span: Span, utc: float) -> tuple[list[Moment], Rerun]:
-    """Every cycle around an instant, replayed.
+    """Replays every cycle around an instant (``utc``, s).
 
     Raises:
         HalError: the recording cannot be replayed.

@@ -1,4 +1,4 @@
-"""What `lumiloop why` says of a moment: state and reason, who contradicts whom, axes, lamps, and what led there."""
+"""Text report of `lumiloop why`: state, reason, disagreeing solutions, known axes, lamps, and preceding changes."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from estimator import Array, se2
 
 AXES: Final = ("x", "y", "heading")
 GAP: Final = 16.27
-"""Squared Mahalanobis distance of three components that is beyond chance (1 in 1000)."""
+"""Squared Mahalanobis distance of three components beyond chance (1 in 1000)."""
 GONE: Final = (Reason.LIDAR_SILENT, Reason.LIDAR_UNREACHABLE)
-"""What is published of a laser that is silent, or not steady again, whoever holds the pose meanwhile."""
+"""Reasons published while the lidar is without data or not steady again, whichever solution holds the pose."""
 MOST: Final = 12
-"""Changes that are listed; beyond that those of state and faults, and of all others the latest."""
+"""Changes that are listed; beyond that, those of state and faults, and the latest of all others."""
 AGAINST: Final = (LinkUse.OCCLUDED, LinkUse.REJECTED)
-"""What is received of these lamps speaks against the place, or did a moment ago."""
+"""Link uses whose RSS is, or was a moment ago, inconsistent with the pose."""
 FITS: Final = 0.2
-"""Deviation (ln) below which what is received fits."""
+"""Residual (ln) below which the RSS is consistent."""
 
 
 def report(told: Sequence[Moment], utc: float, where: str, wide: float, second: bool = False, made: str = "") -> str:
-    """The text of a time, which lasts from ``utc`` on for ``wide``, s (:func:`daemon.diagnosis.moment.chosen`).
+    """Returns the text for a time that lasts from ``utc`` for ``wide``, s (:func:`daemon.diagnosis.moment.chosen`).
 
-    ``second``: it is a whole one, of which the first change is told. ``made``: lines on what the recording was made
-    with, and on its clock, where there is something to say of it.
+    ``second``: a whole second, of which the first change is reported. ``made``: lines on the software that made the
+    recording and on its clock, where needed.
     """
     k, last, changed = chosen(told, utc, second, wide)
     one, begun, apart = told[k], clock(utc), told[k].utc - utc
@@ -58,14 +58,14 @@ def report(told: Sequence[Moment], utc: float, where: str, wide: float, second: 
 
 
 def _named(utc: float, wide: float) -> tuple[str, str]:
-    """How a second is written that begins then and lasts ``wide``, s, and what it is."""
+    """Returns the printed form of a second that begins at ``utc`` and lasts ``wide``, s, and its description."""
     if utc.is_integer():
         return clock(utc, whole=True), "the whole second"
     return clock(utc), "the second from then" if wide >= SECOND_S else "the rest of that second"
 
 
 def _change(after_s: float, changed: int | None) -> str:
-    """What of a whole second is told; ``after_s``: from its end, negative within it."""
+    """Describes the reported change of a whole second; ``after_s``: from its end, negative within it."""
     if changed is None:
         return "nothing changes"
     if after_s < 0.0:
@@ -103,7 +103,7 @@ def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
 
 
 def _because(reason: Reason) -> str:
-    """A reason with the number under which it is published."""
+    """Returns a reason with its published number."""
     return f"reason {int(reason)}, {REASONS[reason][0]}" if reason else REASONS[reason][0]
 
 
@@ -112,7 +112,7 @@ def _in_brackets(remedy: str) -> str:
 
 
 def _fault(number: int) -> tuple[str, str]:
-    """What a fault means and what a person can do; newer software may have recorded one that is not known here."""
+    """Returns meaning and remedy of a fault; newer software may have recorded one that is not known here."""
     return FAULTS[Fault(number)] if number in Fault._value2member_map_ else ("not known here", "")
 
 
@@ -121,7 +121,7 @@ def _has(fault: int, one: Moment) -> bool:
 
 
 def _since(told: Sequence[Moment], k: int, what: Callable[[Moment], object]) -> str:
-    """When something became what it is at ``k``."""
+    """Returns the time of day since which a value has been what it is at ``k``."""
     now = what(told[k])
     begin = k
     while begin > 0 and what(told[begin - 1]) == now:
@@ -137,7 +137,7 @@ def _witnesses(told: Sequence[Moment], k: int) -> Iterator[str]:
 
 
 def laser_dissents(one: Moment) -> bool:
-    """Whether the scan of this cycle came to nothing."""
+    """True if the scan match of this cycle failed."""
     match = None if one.result is None else one.result.match
     return one.scan is not None and one.fresh and match is not None and not match.ok
 
@@ -182,7 +182,7 @@ def _motion(T: Array) -> str:
 
 
 def light_apart(one: Moment) -> tuple[float, float] | None:
-    """How far the place that light alone tells is from the pose, m and rad; None where it tells none."""
+    """Returns the separation of the light solution from the pose, m and rad; None without a light solution."""
     light, pose = one.snapshot.light, one.snapshot.pose
     if light is None or light.pose is None or pose is None:
         return None
@@ -250,7 +250,7 @@ def _link(link: LightLink) -> str:
 
 
 def _listed(changes: list[tuple[bool, str]]) -> Iterator[str]:
-    """The changes that there is room for; what the lamps do in the meantime must not hide a fault."""
+    """Returns the changes that there is room for; changes of lamps must not displace a fault."""
     minor = [k for k, (grave, _) in enumerate(changes) if not grave]
     out = set(minor[: max(0, len(changes) - MOST)])
     if out:
@@ -259,7 +259,7 @@ def _listed(changes: list[tuple[bool, str]]) -> Iterator[str]:
 
 
 def _changes(told: Sequence[Moment]) -> Iterator[tuple[bool, str]]:
-    """One line for everything that became otherwise, oldest first, and whether it was published as state or fault."""
+    """Yields one line per change, oldest first, and whether it was published as state or fault."""
     for before, one in pairwise(told):
         for text in _published(before, one):
             yield True, f"{of_day(one.utc)}  {text}"

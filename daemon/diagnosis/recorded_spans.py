@@ -1,4 +1,4 @@
-"""Recordings and dumps by the time that they cover, and the one that holds a moment that a person names."""
+"""Recordings and dumps by the time that they cover, and the search for the one with a given moment."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from hal.replay.report import LogReport
 from hal.replay.text import unreadable
 
 BEFORE_S, AFTER_S = 20.0, 5.0
-"""How much around the moment is looked at."""
+"""Replayed time before and after the moment, s."""
 UNIX_S: Final = 1e8
-"""A number of seconds beyond is since the Unix epoch, else since the recording began."""
+"""A larger number of seconds counts from the Unix epoch, a smaller one from the start of the recording."""
 DIGITS: Final = 6
-"""Of a second's fraction, beyond which times are not told apart."""
+"""Decimals of a second beyond which times are not distinguished."""
 
 
 class NoMoment(Exception):
-    """There is no such moment in what was recorded; the text says what there is."""
+    """No recording contains the moment; the text lists what there is."""
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A recording, or the part of one in which the clock was not set, and the time (UTC, s) that it covers.
+    """A recording, or its part between two steps of the clock, and the time (UTC, s) that it covers.
 
     Attributes:
-        utc_at_zero: of its monotonic clock, s. made: with what, where that is not what runs now; empty otherwise.
-        before_s: how much of the recording is before it, s.
-        came, gone: how far the clock was set where it begins and ends, s; 0: it was not.
+        utc_at_zero: UTC at zero of its monotonic clock, s. made: software that made it, empty if it is the present one.
+        before_s: duration of the recording before this part, s.
+        came, gone: step of the clock at its begin and end, s; 0: none.
     """
 
     path: Path
@@ -51,13 +51,13 @@ class Span:
 
     @property
     def remarks(self) -> str:
-        """Lines to say before anything is told of it; may be empty."""
+        """Lines to print before the report; may be empty."""
         clock = diagnosis_utc.said(self.begin, self.came, self.end, self.gone)
         return "\n".join([*([self.made] if self.made else []), *clock])
 
 
 def spans(folder: Path) -> list[Span]:
-    """The recordings and dumps in a folder, or the one that it is; in parts where the clock was set, in their order.
+    """Returns the recordings and dumps in a folder, or the one that it is, in order; split where the clock was set.
 
     Raises:
         HalError: it cannot be read, or there is none.
@@ -73,7 +73,7 @@ def spans(folder: Path) -> list[Span]:
     for path in runs:
         try:
             found += _spans(path)
-        except (DataInvalid, DeviceMissing) as error:  # a ring that is being written loses segments meanwhile
+        except (DataInvalid, DeviceMissing) as error:  # an active ring removes segments meanwhile
             if len(runs) == 1:
                 raise
             console.say(f"{error}: passed over")
@@ -81,7 +81,7 @@ def spans(folder: Path) -> list[Span]:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder; raises `HalError` where that may not be known, as of the service's own folder."""
+    """True if there is a folder; raises `HalError` if access is denied, as to the service's own folder."""
     try:
         return path.is_dir()
     except OSError as error:
@@ -114,7 +114,7 @@ def _spans(path: Path) -> list[Span]:
 
 
 def _end(recording: Recording, begin: float) -> float:
-    """When the last record was made, s; a kill or a power cut may leave a segment without any, or without a head."""
+    """Time of the last record, s; a kill or a power cut may leave a segment without any record, or without a head."""
     for segment in reversed(recording.segments):
         last = replace(recording, segments=(segment,)).frames(LogReport())
         if (end := max((frame.t_mono for frame in last), default=None)) is not None:
@@ -123,7 +123,7 @@ def _end(recording: Recording, begin: float) -> float:
 
 
 def _begun(path: Path, header: dict[str, Any]) -> diagnosis_utc.Pair:
-    """When a run began, s, by its monotonic clock and in UTC."""
+    """Returns the start of a run by its monotonic clock and in UTC, both in s."""
     if not {"t_mono", "t_utc"} <= header.keys():
         problem = "its head does not say when it began, so no moment can be found in it"
         raise DataInvalid(str(path), problem, "replay it as a whole: lumiloop replay")
@@ -133,15 +133,15 @@ def _begun(path: Path, header: dict[str, Any]) -> diagnosis_utc.Pair:
 
 
 def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, float]:
-    """The recording that holds a moment, and when that is.
+    """Returns the recording that contains a moment, and the time of the moment.
 
     Returns:
-        The recording with most of the time before it; the moment (UTC), to the microsecond; and how long it lasts, s,
-        more than 0. Of a whole second a part may be recorded: then it is that part. Where a clock was set back, a time
-        came twice in a recording: the later is taken.
+        The recording with most of the time before it; the moment (UTC, s), to the microsecond; and its duration, s,
+        more than 0. If only a part of a whole second is recorded, it is that part. If a clock was set back, a time
+        occurs twice in a recording; the later one is used.
 
     Raises:
-        NoMoment: none does, or that is no time.
+        NoMoment: no recording contains it, or ``words`` is no time.
     """
     wide = width(words)
     asked = [(span, round(utc, 6), round(utc + wide, 6)) for span in recorded for utc in meant(words, span)]
@@ -151,7 +151,7 @@ def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, f
         if utc <= span.end and (begin := max(utc, span.begin)) < end
     ]
     if here:
-        # Of the parts of one recording that which holds the time's begin, and of several the latest.
+        # Of one recording's parts, use the one with the time's begin; of several such parts, the latest.
         part = {one[0].path: one[0] for one in sorted(here, key=lambda one: one[3])}
         there = [one for one in here if one[0] is part[one[0].path]]
         return max(there, key=_has_before)[:3]
@@ -159,43 +159,44 @@ def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, f
 
 
 def _has_before(found: tuple[Span, float, float, bool]) -> tuple[float, float]:
-    """By what a recording is chosen: how much it holds before a moment, and then the latest."""
+    """Sort key of a recording: recorded time before the moment, then the latest."""
     span, begin, *_ = found
     return min(begin - span.begin + span.before_s, BEFORE_S), span.begin - span.before_s
 
 
 def _listed(span: Span) -> str:
-    """A line that says what is recorded."""
+    """Returns a line on a recording."""
     came = f", after the clock was set by {span.came:+.3f} s" if span.came else ""
     begin, end = moment.clock(span.begin), moment.clock(span.end)
     return f"  {begin} to {end}, {span.end - span.begin:.0f} s  {span.path.name}{came}"
 
 
 def whole_second(words: str) -> bool:
-    """Whether no fraction is named: then all that came in that second is meant, as where the journal says the time."""
+    """True if the time has no fraction; it then means the whole second, as in the journal."""
     return not re.search("[.,]", words)
 
 
 def width(words: str) -> float:
-    """Seconds that a time stands for: one of its fraction's last digit; 1 without one, for a minute or a date, too.
+    """Returns the duration that a time stands for, s: one unit of its fraction's last digit.
 
-    So does a time that was printed, and cut, mean its cycle.
+    Without a fraction it is 1, also for a minute or a date. A time that was printed and truncated thus still selects
+    its cycle.
     """
     fraction = re.search("[.,]([0-9]+)", words)
     return moment.SECOND_S * 10.0 ** -min(0 if fraction is None else len(fraction[1]), DIGITS)
 
 
 def meant(words: str, span: Span) -> list[float]:
-    """The instants (UTC) that somebody may mean.
+    """Returns the instants (UTC, s) that a text may mean.
 
-    A time of the day, on the days that the recording covers; a date with a time; local time, of which the night has one
-    hour twice when the clocks are put back, unless it ends with Z or an offset. Or a number: of seconds since the
-    recording began, or since the Unix epoch.
+    It is a time of the day, on each day that the recording covers; or a date with a time. Both are local time unless
+    they end with Z or an offset; one hour of a night occurs twice when clocks are put back. Or it is a number of
+    seconds since the start of the recording, or since the Unix epoch.
 
     Raises:
         NoMoment: it is no time.
     """
-    text = words.strip().replace(",", ".")  # as half of the world writes a fraction, and ISO 8601 too
+    text = words.strip().replace(",", ".")  # a decimal comma, which ISO 8601 permits too
     if re.fullmatch(r"[0-9]+(\.[0-9]+)?", text):
         number = float(text)
         return [number if number > UNIX_S else span.begin - span.before_s + number]
@@ -215,7 +216,7 @@ def meant(words: str, span: Span) -> list[float]:
 
 
 def _instants(at: datetime) -> list[float]:
-    """The instants (UTC, s) of a date and time: without a zone that of the place, which may have it twice, or never."""
+    """Returns the instants (UTC, s) of a date and time; without a zone, local time, which may occur twice or never."""
     if at.tzinfo is not None:
         return [at.timestamp()]
     found = (at.replace(fold=fold).astimezone() for fold in (0, 1))

@@ -1,9 +1,9 @@
-"""Which UTC belongs to a recording's monotonic clock: the computer's clock may be set while it is recorded.
+"""UTC of a recording's monotonic clock, with the steps of the computer's clock during the recording.
 
-A computer without a battery for its clock begins with any time, and sets it once it has a network. Every head says
-both clocks at the moment when it was written, and the recorder begins a segment where they have come apart. So a
-recording is a row of parts, in each of which UTC goes on with the monotonic clock; a moment is reckoned by the clock
-of its part, and whatever is told around it as well.
+A computer without a battery-backed clock starts with any time and is set once it has a network. Every segment head has
+both clocks at the time of writing, and the recorder begins a segment after a step. A recording therefore consists of
+parts in which UTC and the monotonic clock run together. The clock of a moment's part gives the time of the moment, and
+all other times in its report.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from daemon.recording.retention import ABOUT
 from hal.replay.recording import header_of
 
 EVER_S: Final = 1e11
-"""Beyond the year 5000."""
+"""Largest valid time, s: beyond the year 5000."""
 
 Pair = tuple[float, float]
-"""Both clocks at one moment, s: ``t_mono``, UTC."""
+"""Both clocks at one instant, s: ``t_mono``, UTC."""
 
 
 class Part(NamedTuple):
-    """From ``t_mono``, s, on UTC is ``t_mono + utc_at_zero``; ``step``, s: how far it was set then, if it was."""
+    """From ``t_mono``, s, UTC is ``t_mono + utc_at_zero``; ``step``, s: by which the clock was set then, if it was."""
 
     t_mono: float
     utc_at_zero: float
@@ -36,10 +36,10 @@ class Part(NamedTuple):
 
 
 def parts(folder: Path, segments: Sequence[Path], begun: Pair, t_mono: float) -> list[Part]:
-    """The parts of a recording from ``t_mono``, s, on; ``begun``: both clocks when the run began.
+    """Returns the parts of a recording from ``t_mono``, s; ``begun``: both clocks at the start of the run.
 
-    Where no segment says them (they are of older software), a dump that does counts for all that is in it: it was made
-    at its end, and clocks are set soon after a start. When that was is not known.
+    Segments of older software lack them. A dump that has both clocks then applies to all of its content. It was made at
+    its end, and clocks are set soon after a start. The time of the step is then not known.
     """
     told = [pair for segment in segments if (pair := _of(header_of(segment))) is not None]
     dumped = _of_dump(folder)
@@ -57,9 +57,9 @@ def parts(folder: Path, segments: Sequence[Path], begun: Pair, t_mono: float) ->
 
 
 def said(begin: float, came: float, end: float, gone: float) -> list[str]:
-    """What is to be known of a clock that was set by ``came`` and ``gone``, s, where a part begins and ends (UTC).
+    """Returns remarks on clock steps of ``came`` and ``gone``, s, at the begin and end of a part (UTC, s).
 
-    It was set a moment before it was seen to be.
+    The step occurred a moment before it was detected.
     """
     steps = ((came, begin, "after"), (gone, end, "before"))
     return [
@@ -74,12 +74,12 @@ def _ahead(pair: Pair) -> float:
 
 
 def pair_of(t_mono: Any, t_utc: Any) -> Pair | None:
-    """Both clocks as a file says them; None where those are no times that can be."""
+    """Returns both clocks from a file; None if they are no valid times."""
     try:
         pair = float(t_mono), float(t_utc)
     except (TypeError, ValueError, OverflowError):
         return None
-    return pair if all(abs(one) < EVER_S for one in pair) else None  # not a number is neither
+    return pair if all(abs(one) < EVER_S for one in pair) else None  # NaN fails this test too
 
 
 def _of(header: Any) -> Pair | None:
@@ -88,7 +88,7 @@ def _of(header: Any) -> Pair | None:
 
 
 def _of_state(segments: Sequence[Path]) -> list[Pair]:
-    """Of the state that a recording begins with: it was taken before the segment had its head."""
+    """Returns the clocks of the first checkpoint, which was captured before the segment had its head."""
     from daemon.recording.state_file import BadState, read_header
 
     try:

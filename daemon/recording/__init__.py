@@ -1,1 +1,1 @@
-"""Recordings, flight recorder and checkpoints."""
+"""Recordings of a run, the flight recorder, and checkpoints that a replay starts from."""

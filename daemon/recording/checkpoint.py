@@ -1,13 +1,14 @@
-"""The state of a running daemon, taken within a cycle and written out later: where the replay of a dump begins.
+"""Writer of checkpoints: captures the estimator state within a cycle and pickles it later.
 
-Taking it must not delay the cycle, however large the map. So it is two things. What is small and changes all the time
-is pickled at once (:func:`take`). What is large never changes once it is there (keyframes, settled submaps, patches):
-it is only referred to, and pickled afterwards by another thread, piece by piece (:meth:`Taken.pieces`). Submaps are
-few and do change, so the values of their fields are taken at once.
+A replay of a dump starts from such a checkpoint. The capture must not delay the cycle, however large the map is. It
+therefore has two parts. Small values that change all the time are pickled at once (:func:`capture`). Large objects
+never change once they exist (keyframes, finished submaps, patches). The capture only refers to them, and another
+thread pickles them later, one piece at a time (:meth:`Taken.pieces`). Submaps are few and do change, so the values of
+their fields are copied at once.
 
-Jobs under way are functions within functions with what they hold. They are kept by name
-(:func:`daemon.recording.restore.function_within`), and made again from the same place of the same software. What is
-written here is read by `daemon.recording.restore`.
+Pending jobs are nested functions with the variables that they capture. They are stored by name
+(:func:`daemon.recording.restore.function_within`) and rebuilt from the same source line of the same software version.
+`daemon.recording.restore` reads what this module writes.
 """
 
 from __future__ import annotations
@@ -51,28 +52,28 @@ PROTOCOL: Final = 5
 
 
 class CannotTake(Exception):
-    """Something in the state cannot be kept: a defect, which the text names."""
+    """Part of the state cannot be stored; this is a defect, and the text names the part."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Ref:
-    """Stands for a piece."""
+    """Reference to a piece by its number."""
 
     number: int
 
 
 class Taken:
-    """What :func:`take` has taken."""
+    """A captured state: the small values pickled, the large pieces referenced."""
 
     def __init__(self) -> None:
-        self._pieces: list[object] = []  # all stay alive to the end: their numbers go by their identities
+        self._pieces: list[object] = []  # kept alive to the end: numbers are looked up by identity
         self._numbers: dict[int, int] = {}
-        self._said: dict[int, tuple[Any, ...]] = {}  # fields of submaps as they were
+        self._said: dict[int, tuple[Any, ...]] = {}  # fields of submaps at the time of the capture
         self._root = b""
         self._late = False
 
     def hold(self, piece: object) -> _Ref:
-        """Refer to a piece."""
+        """Returns the reference to a piece; adds the piece at its first use."""
         number = self._numbers.get(id(piece))
         if number is None:
             if isinstance(piece, Submap):
@@ -80,7 +81,7 @@ class Taken:
                 return self.hold(piece)
             number = self._numbers[id(piece)] = len(self._pieces)
             self._pieces.append(piece)
-            if not self._late:  # the submaps that it refers to, while they are as they are
+            if not self._late:  # capture the submaps that it refers to before they change
                 if isinstance(piece, Keyframe):
                     self.hold(piece.submap)
                 elif isinstance(piece, Settled):
@@ -88,7 +89,7 @@ class Taken:
         return _Ref(number)
 
     def hold_all(self, submaps: Iterable[Submap]) -> None:
-        """Refer to submaps, and to those that they refer to, as they are now."""
+        """Adds submaps, and the submaps that they refer to, with their present field values."""
         numbers, pieces, said = self._numbers, self._pieces, self._said
         waiting = list(submaps)
         while waiting:
@@ -108,12 +109,12 @@ class Taken:
                 waiting.append(submap.settled.witness.submap)
 
     def seal(self, root: object) -> None:
-        """Pickle what is small; called once."""
+        """Pickles the small values; called once."""
         self._root = _pickled(root, self)
         self._late = True
 
     def pieces(self) -> Iterator[Piece]:
-        """Everything, pickled a piece at a time; may run in another thread while the daemon goes on."""
+        """Yields every piece in pickled form, the root last; may run in another thread while the daemon continues."""
         number = 0
         while number < len(self._pieces):  # pieces refer to more pieces
             piece = self._pieces[number]
@@ -140,7 +141,7 @@ _submap_of: Final = attrgetter("submap")
 
 
 class _Dict(NamedTuple):
-    """A dict that is a piece of its own, so that pickling does not take it for a reference to itself."""
+    """A dict that is a piece of its own; the wrapper keeps the pickler from replacing it by a reference to itself."""
 
     content: dict[Any, Any]
 
@@ -151,12 +152,12 @@ def _fields_of(piece: object) -> dict[str, Any]:
 
 
 def capture(state: State, rest: dict[str, object]) -> Taken:
-    """Take the estimator's state and the ``rest``, which may refer to the same things.
+    """Captures the estimator state and the ``rest``, which may refer to the same objects.
 
-    It takes longer the more submaps and keyframes there are; docs/replay.md has figures.
+    The duration grows with the number of submaps and keyframes; docs/replay.md has figures.
 
     Raises:
-        CannotTake: something in them cannot be pickled.
+        CannotTake: some part cannot be pickled.
     """
     taken = Taken()
     taken.hold_all(set(map(_submap_of, state.map.keyframes.values())).union(state.map.graph.submaps.values()))
@@ -170,14 +171,14 @@ def capture(state: State, rest: dict[str, object]) -> Taken:
 
 
 class _Writer(pickle.Pickler):
-    """Pickles; pieces become references."""
+    """Pickler that writes references in place of pieces."""
 
     def __init__(self, file: io.BytesIO, taken: Taken) -> None:
         super().__init__(file, PROTOCOL)
         self._taken = taken
 
     def reducer_override(self, obj: object) -> Any:
-        """How the kinds of objects are kept that pickle does not know how to keep."""
+        """Returns the reduction of objects that pickle does not store by itself."""
         kept = _KEPT.get(type(obj))
         if kept is not None:
             return kept(obj, self._taken)

@@ -1,7 +1,8 @@
-"""The one thread that writes: ready bytes ten times a second, synced to the disk every 0.4 s.
+"""Disk thread of a recording: writes records to segments every 0.1 s and syncs them to the disk every 0.4 s.
 
-A power cut therefore costs at most half a second, and a disk that is slow, full or gone costs only what could not be
-written: it is counted, said once, noted in the recording as soon as there is room again, and never stops the daemon.
+A power cut therefore loses at most half a second. A slow, full or absent disk loses only what it could not store. Lost
+records are counted, logged once, and noted in the recording as soon as there is room again. They never stop the
+daemon.
 """
 
 from __future__ import annotations
@@ -28,19 +29,20 @@ SYNC_S: Final = 0.4
 RETRY_S: Final = 5.0
 SEGMENT_BYTES: Final = 64 << 20
 BACKLOG_BYTES: Final = 32 << 20
-"""Bytes that may wait for a slow disk; beyond, records are dropped and counted."""
+"""Bytes that may wait for a slow disk; further records are dropped and counted."""
 CLOCK: Final = "clock"
-"""Key of a head: the monotonic clock and UTC, s, both of the moment that it was written at."""
+"""Key in a segment head: monotonic clock and UTC at the time of writing, both in s."""
 STEP_S: Final = 0.05
-"""UTC that is further from what a head says has been set: another segment says what is true from then on."""
+"""Change of UTC against the segment head, s, above which the clock counts as set; a new segment then begins."""
 STEP_AGAIN_S: Final = 10.0
-"""But no more often than this: a clock may be set all the time."""
+"""Minimum interval between two such segments, s: a clock may be set repeatedly."""
 READINGS, TIGHT_S = 5, 1e-3
-"""Two clocks are read again, at most so often, if it took longer, s: the thread may have had to wait in between."""
+"""Limit of repeated readings of two clocks, and the duration, s, above which a reading repeats. The thread may have
+waited between the readings."""
 
 
 def both(clock: Clock) -> tuple[float, float]:
-    """The monotonic clock and UTC of one moment, s: they are told apart by steps of UTC alone."""
+    """Returns the monotonic clock and UTC at one instant, both in s; only steps of UTC change their difference."""
     best = math.inf, 0.0, 0.0
     for _ in range(READINGS):
         begun, utc, ended = clock.now(), clock.utc(), clock.now()
@@ -52,24 +54,24 @@ def both(clock: Clock) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turn:
-    """Between two records: a new segment begins here.
+    """Marker between two records: a new segment begins here.
 
     Attributes:
-        then: called by the writing thread, with the number of the segment, or None where it could not be begun.
+        then: called by the writing thread with the number of the segment, or None if it could not be opened.
     """
 
     then: Callable[[int | None], None]
 
 
 class SegmentWriter:
-    """Appends records to segments in a folder of its own; see `hal.replay.recording` for the format.
+    """Appends records to segments in a folder of its own; `hal.replay.recording` defines the format.
 
     Attributes:
-        folder: where this recording goes.
-        records, bytes: written so far. lost: records that could not be written. taken: bytes of the records taken.
-        closed: is told of every segment that is complete: its number, its path. Called by the writing thread.
-        error: why nothing is being written at the moment; empty while all is well.
-        busy_since: when the write began that has not ended yet (`time.monotonic`), None: there is none.
+        folder: of this recording.
+        records, bytes: written so far. lost: records that could not be written. taken: bytes of the accepted records.
+        closed: called by the writing thread for every complete segment, with its number and its path.
+        error: why nothing is being written at present; empty without trouble.
+        busy_since: start of the write in progress (`time.monotonic`, s); None between writes.
     """
 
     def __init__(
@@ -81,10 +83,10 @@ class SegmentWriter:
         beside: Mapping[str, bytes] | None = None,
         clock: Clock | None = None,
     ) -> None:
-        """Make the folder and open the first segment; where that is not possible it is tried again, as later on.
+        """Makes the folder and opens the first segment; after a failure the writer tries again later.
 
-        ``beside``: files of the folder, by name, that every segment needs; they are written before the first.
-        ``clock``: whose times every head is to say; read by the writing thread.
+        ``beside``: files by name that every segment needs; they are written into the folder before the first segment.
+        ``clock``: read by the writing thread for the times in every segment head.
         """
         self.records = self.bytes = self.lost = self.taken = 0
         self.error = ""
@@ -107,7 +109,7 @@ class SegmentWriter:
         self._synced_at = time.monotonic()
         self._dirty = False
         self._stop = threading.Event()
-        self.folder = parent / f"{name}-{token_hex(4)}"  # if it can be made later only: nobody else's, unseen
+        self.folder = parent / f"{name}-{token_hex(4)}"  # random suffix: unique even if made later
         try:
             self.folder = _new_folder(parent, name)
             self._open()
@@ -117,7 +119,7 @@ class SegmentWriter:
         self._thread.start()
 
     def put(self, kind: Kind, channel: int, t_mono: float, payload: bytes) -> None:
-        """Take one record; returns at once."""
+        """Queues one record; returns at once."""
         frame = pack_frame(kind, channel, t_mono, payload)
         with self._lock:
             if self._waiting + len(frame) > BACKLOG_BYTES or len(payload) > LONGEST or self._stop.is_set():
@@ -129,7 +131,7 @@ class SegmentWriter:
             self._t_mono = t_mono
 
     def begin(self, then: Callable[[int | None], None]) -> None:
-        """Begin a new segment with the next record; ``then`` is called as :class:`Turn` says. Returns at once."""
+        """Begins a new segment with the next record and calls ``then`` as in :class:`Turn`; returns at once."""
         with self._lock:
             if not self._stop.is_set():
                 self._ready.append(Turn(then))
@@ -137,7 +139,7 @@ class SegmentWriter:
         then(None)
 
     def close(self) -> None:
-        """Write and sync what is left; idempotent."""
+        """Writes and syncs the remaining records; idempotent."""
         if not self._stop.is_set():
             self._stop.set()
             self._thread.join()
@@ -150,7 +152,7 @@ class SegmentWriter:
         self._close()
 
     def _turn(self) -> None:
-        """Write what is ready; on trouble drop it, count it, and try again later in a new segment."""
+        """Writes the queued records; on an error drops and counts them, and tries again later in a new segment."""
         with self._lock:
             ready, self._ready, self._waiting = self._ready, [], 0
         batches: list[Batch] = []
@@ -171,13 +173,13 @@ class SegmentWriter:
                     batches[0] = None, frames
                 self._write(frames)
                 del batches[0]
-        except Exception as error:  # noqa: BLE001  no memory, or a defect, must not end the thread either; it is told
+        except Exception as error:  # noqa: BLE001  neither lack of memory nor a defect may end the thread
             self._fail(error, batches)
         finally:
             self.busy_since = None
 
     def _write(self, frames: list[bytes]) -> None:
-        """Append whole records; rotates first where the segment is full, or the clock was set."""
+        """Appends whole records; first rotates if the segment is full or the clock was set."""
         if frames and (self._good > self._segment_bytes or self._clock_was_set()):
             self._close()
             self._open()
@@ -196,7 +198,7 @@ class SegmentWriter:
             self.error = ""
 
     def _clock_was_set(self) -> bool:
-        """Whether UTC is no longer what this segment's head says it is."""
+        """True if UTC differs from the segment head by more than :data:`STEP_S`."""
         if self._clock is None or time.monotonic() - self._stepped_at < STEP_AGAIN_S:
             return False
         t_mono, utc = both(self._clock)
@@ -206,7 +208,7 @@ class SegmentWriter:
         return True
 
     def _gap(self) -> bytes:
-        """A note in the recording where records are missing."""
+        """Returns a note record for missing records; empty if none are missing."""
         if self._noted == self.lost:
             return b""
         note = f"{self.lost - self._noted} records before this one were lost: {self.error or 'the disk is too slow'}"
@@ -230,9 +232,9 @@ class SegmentWriter:
                 turn.then(None)
 
     def _open(self) -> None:
-        """Start the next segment with a head of its own."""
+        """Starts the next segment with its own head."""
         self._segment += 1
-        self.folder.mkdir(parents=True, exist_ok=True)  # somebody may have cleaned up behind us
+        self.folder.mkdir(parents=True, exist_ok=True)  # the folder may have been deleted meanwhile
         for name in list(self._beside):
             write_whole(self.folder / name, self._beside[name])
             del self._beside[name]
@@ -246,7 +248,7 @@ class SegmentWriter:
         sync_folder(self.folder)
 
     def _now(self) -> dict[str, tuple[float, float]]:
-        """What a head says of the moment."""
+        """Returns the times for a segment head, s."""
         if self._clock is None:
             return {}
         t_mono, utc = both(self._clock)
@@ -254,7 +256,7 @@ class SegmentWriter:
         return {CLOCK: (t_mono, utc)}
 
     def _close(self) -> None:
-        """Cut off a record that was written in part, sync, close; a segment without a whole head is removed."""
+        """Truncates a partly written record, syncs and closes; removes a segment without a whole head."""
         if self._file < 0:
             return
         file, self._file = self._file, -1
@@ -272,7 +274,7 @@ class SegmentWriter:
 
 
 Batch = tuple[Turn | None, list[bytes]]
-"""Where a new segment begins, if one does, and the records from there on."""
+"""Start of a new segment, if any, and the records that follow it."""
 
 
 def _batches(ready: list[bytes | Turn]) -> list[Batch]:
@@ -286,7 +288,7 @@ def _batches(ready: list[bytes | Turn]) -> list[Batch]:
 
 
 def _nobody(segment: int, path: Path) -> None:
-    """Nobody wants to know."""
+    """Ignores a complete segment; default of :attr:`SegmentWriter.closed`."""
 
 
 def _write_all(file: int, data: bytes) -> None:
@@ -296,7 +298,7 @@ def _write_all(file: int, data: bytes) -> None:
 
 
 def _new_folder(parent: Path, name: str) -> Path:
-    """A folder that did not exist before: a clock that was not set yet may say the same time twice."""
+    """Makes a folder that did not exist before; a clock that is not set yet may give the same time twice."""
     for number in range(1, 10_000):
         folder = parent / (name if number == 1 else f"{name}-{number}")
         try:

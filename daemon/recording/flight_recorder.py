@@ -1,7 +1,7 @@
-"""The flight recorder: when a recording gets a state to be replayed from, and when a dump of it is made.
+"""Flight recorder: decides when a recording gets a checkpoint, and when a dump of it is made.
 
-All of it runs in the loop's thread, at the end of a cycle: it captures the state
-(`daemon.recording.checkpoint.capture`) and hands it to the threads that write.
+All of it runs in the loop thread at the end of a cycle. It captures the state
+(`daemon.recording.checkpoint.capture`) and passes it to the threads that write.
 """
 
 from __future__ import annotations
@@ -36,29 +36,30 @@ if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
 log = logging.getLogger(__name__)
 
 EVERY_S: Final = 600.0
-"""A recording that is kept as a whole gets a state so often, and with every segment."""
+"""Checkpoint interval of a recording that is kept whole, s; every segment adds one."""
 SHARE, LEAST_S = 5.0, 30.0
-"""A ring gets so many states in the time that it reaches back; not more often than this, s."""
+"""Checkpoints of a ring within the time that it keeps; and their minimum interval, s."""
 RETRY_S: Final = 60.0
 AFTER_S: Final = 5.0
-"""A dump because of a fault shows what became of it for so long."""
+"""Time after a fault that its dump still covers, s."""
 AGAIN_S: Final = 300.0
-"""The same fault makes another dump after so long."""
+"""Minimum interval between two dumps of the same fault, s."""
 ASKED_AGAIN_S: Final = 10.0
-"""Whoever asks for dumps gets another after so long: each costs a cycle the taking of a state."""
+"""Minimum interval between two requested dumps, s; each costs a cycle the capture of a state."""
 JOBS: Final = 64
-"""Beyond so many jobs under way those are looked for that nobody waits for."""
+"""Number of pending jobs above which jobs without a recipient are removed."""
 UNASKED: Final = 16
-"""Jobs that the estimator waits for no longer, but that may still answer."""
+"""Jobs kept although the estimator waits for them no longer; they may still give a result."""
 UNDER_WAY: Final = "another dump is just being made"
 QUIET: Final = frozenset((Fault.RECORDER_FAILED, Fault.FLIGHT_RECORDER_FAILED))
-"""Faults that a dump cannot tell anything about."""
+"""Faults on which a dump has no information."""
 
 
 class Line:
-    """What a lidar's line has said that whoever joins later must know: how it was opened, and the latest scans.
+    """Bytes of the lidar line that a replay from the middle needs: the opening exchange and the latest scans.
 
-    A piece of bytes may end a scan, several of them, or none: the last three that end some are kept, with all since.
+    A chunk of bytes may complete one scan, several or none. The last three chunks that complete a scan are kept, with
+    all bytes since.
     """
 
     OPENING_BYTES: Final = 64 << 10
@@ -67,12 +68,12 @@ class Line:
 
     def __init__(self) -> None:
         self._opening: list[bytes] = []
-        self._latest: deque[tuple[bytes, bool]] = deque()  # frames, and whether a scan has ended with them
+        self._latest: deque[tuple[bytes, bool]] = deque()  # records, and whether each completed a scan
         self._streaming = False
         self._ends = self._opening_bytes = self._latest_bytes = 0
 
     def passed(self, kind: Kind, t_mono: float, payload: bytes) -> None:
-        """Something passed through the port."""
+        """Records bytes or an event of the port."""
         frame = pack_frame(kind, 0, t_mono, payload)
         if kind in (Kind.OPEN, Kind.LOST):
             self._opening, self._streaming = [], False
@@ -88,7 +89,7 @@ class Line:
             self._opening_bytes += len(frame)
 
     def scan(self) -> None:
-        """A scan was complete with what has just passed."""
+        """Marks that the latest bytes completed a scan."""
         self._streaming = True
         if self._latest and not self._latest[-1][1]:
             self._latest[-1] = self._latest[-1][0], True
@@ -102,21 +103,21 @@ class Line:
         self._ends -= ended
 
     def said(self) -> bytes:
-        """All of it, as records."""
+        """Returns all kept bytes, as records."""
         gap = [pack_frame(Kind.LOST, 0, 0.0, b"what is between is left out")] if self._latest else []
         return b"".join((*self._opening, *gap, *(frame for frame, _ in self._latest)))
 
 
 class BlackBox:
-    """Looks after the states and dumps of one recording.
+    """Makes the checkpoints and dumps of one recording.
 
     Attributes:
-        line: of the lidar. error: why the latest state could not be taken; empty while all is well.
-        take_s: seconds that taking the latest state took.
+        line: of the lidar. error: why the latest capture failed; empty without trouble.
+        take_s: duration of the latest capture, s.
     """
 
     def __init__(self, disk: SegmentWriter, clock: Clock, header: dict[str, Any], keep_s: float = math.inf) -> None:
-        """``keep_s``: how far back the recording reaches; infinite: as far as there is room."""
+        """``keep_s``: how far back the recording reaches, s; infinite: as far as the disk has room."""
         self.line = Line()
         self.error = ""
         self.take_s = 0.0
@@ -140,49 +141,50 @@ class BlackBox:
 
     @property
     def failing(self) -> str:
-        """What of states and dumps cannot be kept at the moment, empty while all is well."""
+        """Why checkpoints or dumps cannot be stored at present; empty without trouble."""
         return self.error or self.flight.error
 
     def attach(
         self, cycle: Cycle, state: Callable[[], State | None], faults: Callable[[], tuple[Fault, ...]] = tuple
     ) -> None:
-        """Say what is recorded. ``state``: the estimator's, None before it is loaded. ``faults``: that are present."""
+        """Sets the sources. ``state``: estimator state, None before it is loaded. ``faults``: those present."""
         self._cycle, self._state, self._faults = cycle, state, faults
 
     def on_cycle(self, record: CycleRecord) -> None:
-        """A cycle has ended and is recorded; nothing that comes from now on belongs to it. Never raises."""
+        """Processes the end of a recorded cycle; later input does not belong to it. Never raises."""
         try:
             self._look(record)
-        except Exception as error:  # a defect in here must not end the cycle; it is a fault, and told in full
+        except Exception as error:  # a defect here must not end the cycle; it becomes a fault and is logged in full
             if not self.error:
                 log.exception("the flight recorder has failed")
             self.error = repr(error)
             self._due = record.t_mono + RETRY_S
 
     def _look(self, record: CycleRecord) -> None:
-        """Follow the jobs and the faults; take a state, or make a dump, where it is due."""
+        """Updates pending jobs and faults; makes a checkpoint or a dump where one is due."""
         self._follow_jobs(record)
         now = record.t_mono
         if record.cycle == 1:
             self.flight.prepare()
-        if self._gap and not self._disk.error:  # what comes after a gap replays from a state alone
+        if self._gap and not self._disk.error:  # after a gap, a replay can start only from a checkpoint
             self._due = now
         self._gap = bool(self._disk.error)
-        if self._ring:  # what is kept as a whole needs no dumps
+        if self._ring:  # a recording that is kept whole needs no dumps
             self._watch_faults(now)
         if self._pending is not None and now >= self._pending[0]:
             (_, fault), self._pending = self._pending, None
             self._dump(*_of_fault(fault), _said)
         elif now >= self._due or self._disk.taken - self._bytes > SEGMENT_BYTES:
-            if self._disk.taken - self._bytes >= self.flight.state_bytes:  # large maps: at most half is states
+            if self._disk.taken - self._bytes >= self.flight.state_bytes:  # large maps: at most half is checkpoints
                 self._begin(_nothing)
             else:
                 self._due = now + self._every_s
 
     def dump(self, on_done: OnDone) -> None:
-        """Make a dump of what there is, now; ``on_done`` in this thread when it is there, or why not.
+        """Makes a dump now; calls ``on_done`` in this thread with an empty text, or with the reason of a failure.
 
-        One at a time, each holds a state until the disk has it; and another only after :data:`ASKED_AGAIN_S`.
+        Only one dump is made at a time, because each holds a state until it is on the disk. The next one is allowed
+        after :data:`ASKED_AGAIN_S`.
         """
         now, loop = self._clock.now(), asyncio.get_running_loop()
         if self._asked:
@@ -197,21 +199,21 @@ class BlackBox:
             on_done(reason)
 
         def back(reason: str) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits any more
+            with contextlib.suppress(RuntimeError):  # the loop has closed: there is no client any more
                 loop.call_soon_threadsafe(end, reason)
 
         self._asked, self._ask_from = True, now + ASKED_AGAIN_S
         try:
             self._dump(ASKED, "somebody has asked for it", back)
-        except Exception as error:  # a defect in here must not leave the client waiting, and is told in full
+        except Exception as error:  # a defect here must not leave the client waiting; it is logged in full
             log.exception("the flight recorder has failed")
             end(repr(error))
 
     def close(self, ended: bool) -> None:
-        """Finish what is under way; after the disk.
+        """Finishes pending work; called after the disk writer has closed.
 
-        A dump that was to wait for what becomes of its fault waits no longer: what was recorded goes with the next
-        start. It needs no state of its own, for nothing comes after it.
+        The next start removes the ring. A dump that still waits for the time after its fault is therefore made at once.
+        It needs no checkpoint of its own, since nothing follows it.
         """
         if self._pending is not None:
             (_, fault), self._pending = self._pending, None
@@ -219,7 +221,7 @@ class BlackBox:
         self.flight.close(ended)
 
     def _follow_jobs(self, record: CycleRecord) -> None:
-        """Keep the jobs that may still answer."""
+        """Keeps the jobs that may still give a result."""
         if record.limits is not None and record.result is not None and record.result.jobs:
             self._jobs.update((job.job_id, job) for job in record.result.jobs)
             if len(self._jobs) > JOBS and (state := self._state()) is not None:
@@ -228,7 +230,7 @@ class BlackBox:
             self._jobs.pop(job_id, None)
 
     def _let_go(self, state: State) -> None:
-        """Forget the jobs that nobody waits for any more, but the latest: they hold what they are about."""
+        """Removes jobs without a recipient, except the latest ones; jobs keep their input data alive."""
         unasked = [job_id for job_id in self._jobs if job_id not in state.jobs.pending]
         for job_id in unasked[:-UNASKED]:
             del self._jobs[job_id]
@@ -244,7 +246,7 @@ class BlackBox:
                 self._dumped[fault] = now
 
     def _begin(self, then: Callable[[int | None], None]) -> None:
-        """Begin a segment with the state of this moment."""
+        """Begins a segment with a checkpoint of the present state."""
         now, utc = both(self._clock)
         taken = self._take()
         self._due = now + (RETRY_S if taken is None else self._every_s)
@@ -262,7 +264,7 @@ class BlackBox:
         then: Callable[[int | None], None],
         segment: int | None,
     ) -> None:
-        """In the writing thread: the segment has its number. ``now``: by both clocks, s, when its state was taken."""
+        """Queues the checkpoint once the segment has its number; writing thread. ``now``: both clocks at capture, s."""
         if segment is not None:
             header = {**self._header, "segment": segment, "t_state": now[0], CLOCK: now, "cycle": cycle}
             self.flight.begun(Begun(segment, now[0], taken, line, header))
@@ -295,7 +297,7 @@ class BlackBox:
         return taken
 
     def _about(self, reason: str, why: str) -> dict[str, Any]:
-        """What a dump says of itself."""
+        """Returns the metadata of a dump."""
         t_mono, t_utc = both(self._clock)
         return {
             "reason": re.sub(r"[^a-z0-9-]", "-", reason),
@@ -319,17 +321,17 @@ class BlackBox:
 
 
 def _of_fault(fault: Fault) -> tuple[str, str]:
-    """Reason of a dump because of a fault, and what the fault means."""
+    """Returns the reason text of a dump after a fault, and the meaning of the fault."""
     return f"fault-{int(fault)}", FAULTS[fault][0]
 
 
 def _none() -> None:
-    """There is no state yet."""
+    """No estimator state yet."""
 
 
 def _nothing(segment: int | None) -> None:
-    """Nobody waits for the segment."""
+    """Ignores the number of the segment."""
 
 
 def _said(reason: str) -> None:
-    """Nobody waits for the dump."""
+    """Ignores the result of the dump."""

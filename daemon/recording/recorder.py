@@ -1,9 +1,10 @@
-"""Recording a run: every byte from and to the devices, every input, every decision of every cycle.
+"""Recorder of a run: every byte from and to the devices, every input, and every decision of every cycle.
 
-The loop thread only appends to a list; one thread (`daemon/recording/disk_writer.py`) writes what is ready. What is
-kept is all it takes to repeat the run exactly: the same bytes go through the same codec, and each cycle consumes what
-it consumed, under the same caps. The published pose, state and reason are kept too, so that a replay can say whether
-they are the same; and the published faults, most of which a replay cannot have: drivers and the computer said them.
+The loop thread only appends to a list; one thread (`daemon/recording/disk_writer.py`) writes the records. A recording
+contains all that an exact repetition needs. The same bytes pass the same codec, and each cycle consumes the same input
+under the same caps. The published pose, state and reason are recorded too, so that a replay can compare them. The
+published faults are also recorded. A replay cannot reproduce most of them, because drivers and the computer raised
+them.
 """
 
 from __future__ import annotations
@@ -39,20 +40,20 @@ from hal.port.port import PortOpener
 from hal.replay.recording import Kind, pack_imu, pack_odometry, pack_samples, pack_scan
 
 MAP: Final = "map"
-"""Key of a recording's head where the run began with a map."""
+"""Key of a recording's head that is present if the run began with a map."""
 LIDAR, PHOTODIODE = 0, 0
-"""Channels: which device of its kind."""
+"""Channels: index of the device among those of its kind."""
 
 Pose = tuple[float, float, float]
 
 
 def switch_name(sha256: str) -> str:
-    """File of a recording's folder: a map that the run has gone on in."""
+    """Returns the file name of a map that the run switched to, in the folder of the recording."""
     return f"switch-{sha256[:16]}.lumimap"
 
 
 class CommandEntry(msgspec.Struct, frozen=True, array_like=True):
-    """A command as a cycle consumed it."""
+    """A command as a cycle consumed it; ``t_begin`` in s, ``pose`` as (x, y, yaw) in m, m, rad."""
 
     t_begin: float
     order: str
@@ -60,17 +61,17 @@ class CommandEntry(msgspec.Struct, frozen=True, array_like=True):
 
 
 class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
-    """A cycle as it is recorded; see `daemon.runtime.cycle_parts.CycleRecord`. Fields are only ever added at the end.
+    """A recorded cycle; see `daemon.runtime.cycle_parts.CycleRecord`. New fields go at the end only.
 
     Attributes:
-        limits: (ICP iterations, points, whether the map may be updated), None where nothing was stepped.
-        odom, map_odom: T_odom_base and T_map_odom after the cycle, None before the first step.
-        codes: `Limits.codes`, None where nothing was stepped or before there were lights.
-        samples: blocks received by then. light: pose of the `lights` filter after the cycle, None where it has none.
+        limits: (ICP iterations, points, whether the map may be updated); None if no step was made.
+        odom, map_odom: T_odom_base and T_map_odom after the cycle (m, m, rad); None before the first step.
+        codes: `Limits.codes`; None if no step was made, or in recordings without light.
+        samples: blocks received so far. light: pose of the light filter after the cycle; None where it has none.
         rung: `Limits.level`. switched: `CycleRecord.switched`; the map is in a file of its own (:func:`switch_name`).
-        reason: published with the state, None in recordings of before it was kept; they know of no ``faults`` either.
-        faults: numbers of all that were published, gravest first. In every cycle, for a recording may begin with any.
-        waiting: `CycleRecord.waiting`, all that state and reason take from a driver.
+        reason: published with the state; None in older recordings, which have no ``faults`` either.
+        faults: numbers of all published faults, gravest first. Every cycle has them: a recording may begin with any.
+        waiting: `CycleRecord.waiting`, the only driver value that state and reason depend on.
     """
 
     cycle: int
@@ -94,13 +95,13 @@ class CycleEntry(msgspec.Struct, frozen=True, array_like=True):
     waiting: bool = False
 
     def caps(self) -> Limits | None:
-        """The step's caps as the estimator takes them."""
+        """Returns the caps of the step as the estimator's type; None if no step was made."""
         if self.limits is None:
             return None
         return Limits(*self.limits, UNLIMITED.codes if self.codes is None else self.codes, self.rung)
 
     def orders(self) -> list[Command]:
-        """The commands as the estimator takes them."""
+        """Returns the commands as the estimator's type."""
         return [
             Command(entry.t_begin, Order(entry.order), None if entry.pose is None else np.array(entry.pose))
             for entry in self.commands
@@ -112,7 +113,11 @@ _decode: Final = msgspec.msgpack.Decoder(CycleEntry).decode
 
 
 def decode_cycle(payload: bytes) -> CycleEntry:
-    """The cycle in a CYCLE record; raises `msgspec.DecodeError` for anything else."""
+    """Returns the cycle in a CYCLE record.
+
+    Raises:
+        msgspec.DecodeError: the payload is not a cycle.
+    """
     return _decode(payload)
 
 
@@ -152,18 +157,18 @@ def _faults(snapshot: Snapshot) -> tuple[int, ...]:
 
 
 def light_of(result: StepResult | None) -> Pose | None:
-    """Pose of the `lights` filter; None where there is none."""
+    """Returns the pose of the light filter as (x, y, yaw) in m, m, rad; None where there is none."""
     return None if result is None or result.lights is None else _pose(result.lights.T_map_base)
 
 
 class Recorder:
-    """Taps a running daemon. Every method returns at once and never raises for what a disk can do.
+    """Records a running daemon. No method blocks, and no disk error raises, except in :meth:`keep_switch`.
 
-    Hand :meth:`tap` to the driver as its port opener, :meth:`on_scan`, :meth:`on_samples`, :meth:`on_odometry` and
-    :meth:`on_imu` to the sources around the callbacks they had, and :meth:`on_cycle` to the cycle.
+    :meth:`tap` wraps the port opener of a driver. :meth:`on_scan`, :meth:`on_samples`, :meth:`on_odometry` and
+    :meth:`on_imu` wrap the callbacks of the sources. :meth:`on_cycle` observes the cycle.
 
     Attributes:
-        t_begun: start of the run, as its head says it: what has not spoken yet is silent from then on.
+        t_begun: start of the run as in the head, s; an input without data counts as timed out from then on.
     """
 
     def __init__(
@@ -175,12 +180,11 @@ class Recorder:
         start: Start | None = None,
         keep_s: float = math.inf,
     ) -> None:
-        """Start a recording of its own in a new folder below ``folder``, named by the time of its start.
+        """Starts a recording in a new folder below ``folder``, named by its start time.
 
-        ``lights``, ``start``: what the estimator is told of lights, and the map that it begins with: a replay has to
-        tell it again. ``keep_s``: how far back it reaches, see `daemon.recording.retention`. Where nothing can be
-        written, now or later, :attr:`error` says so and it is tried again: a robot is to know its place on a full disk,
-        too.
+        ``lights``, ``start``: light setup and initial map of the estimator, which a replay needs again. ``keep_s``: how
+        far back the recording reaches, s (`daemon.recording.retention`). If nothing can be written, now or later,
+        :attr:`error` gives the reason and the writer tries again. A robot must localise on a full disk, too.
         """
         t_mono, t_utc = both(clock)
         started = datetime.fromtimestamp(t_utc, UTC)
@@ -201,34 +205,34 @@ class Recorder:
 
     @property
     def error(self) -> str:
-        """Why nothing is being written at the moment; empty while all is well."""
+        """Why nothing is being written at present; empty without trouble."""
         return self.disk.error
 
     @property
     def failing(self) -> set[str]:
-        """Which parts of the recording do not work at the moment."""
+        """Names of the parts of the recording that do not work at present."""
         return {name for name, error in (("recorder", self.error), ("flight recorder", self.box.failing)) if error}
 
     def close(self, ended: bool = True) -> None:
-        """Write and sync what is left; idempotent. ``ended``: the run has, as it should."""
+        """Writes and syncs the remaining data; idempotent. ``ended``: the run ended as intended."""
         self.disk.close()
         self.box.close(ended)
 
     def on_cycle(self, record: CycleRecord) -> None:
-        """Keep a cycle's decisions (`daemon.runtime.cycle_parts.Tap`)."""
+        """Records the decisions of a cycle (`daemon.runtime.cycle_parts.Tap`)."""
         self.disk.put(Kind.CYCLE, 0, record.t_mono, _encode(_entry(record)))
         self.box.on_cycle(record)
 
     def keep_switch(self, sha256: str, content: bytes) -> None:
-        """Keep a map that the run is to go on in; for another thread, it may be large.
+        """Stores a map that the run is about to switch to; for another thread, because the map may be large.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         write_whole(self.disk.folder / switch_name(sha256), content)
 
     def on_scan(self, then: Callable[[RawScan], None]) -> Callable[[RawScan], None]:
-        """A scan callback that marks the scan and passes it on."""
+        """Wraps a scan callback: records the scan and forwards it."""
 
         def mark(scan: RawScan) -> None:
             self.disk.put(Kind.SCAN, LIDAR, scan.t_rx, pack_scan(scan))
@@ -238,7 +242,7 @@ class Recorder:
         return mark
 
     def on_samples(self, then: Callable[[RawSamples], None]) -> Callable[[RawSamples], None]:
-        """A callback for blocks of samples that keeps the block and passes it on."""
+        """Wraps a sample-block callback: records the block and forwards it."""
 
         def keep(block: RawSamples) -> None:
             self.disk.put(Kind.SAMPLES, PHOTODIODE, block.t1, pack_samples(block))
@@ -247,7 +251,7 @@ class Recorder:
         return keep
 
     def on_odometry(self, then: Callable[[RawOdometry], None]) -> Callable[[RawOdometry], None]:
-        """An odometry callback that keeps the reading and passes it on."""
+        """Wraps an odometry callback: records the reading and forwards it."""
 
         def keep(reading: RawOdometry) -> None:
             self.disk.put(Kind.ODOMETRY, 0, reading.t_rx, pack_odometry(reading))
@@ -256,7 +260,7 @@ class Recorder:
         return keep
 
     def on_imu(self, then: Callable[[RawImu], None]) -> Callable[[RawImu], None]:
-        """A gyro callback that keeps the reading and passes it on."""
+        """Wraps a gyro callback: records the reading and forwards it."""
 
         def keep(reading: RawImu) -> None:
             self.disk.put(Kind.IMU, 0, reading.t_rx, pack_imu(reading))
@@ -265,7 +269,7 @@ class Recorder:
         return keep
 
     def tap(self, opener: PortOpener, channel: int = LIDAR) -> PortOpener:
-        """A port opener whose ports keep what passes through them."""
+        """Wraps a port opener: its ports record all bytes that pass through them."""
         return tapped(opener, partial(self._passed, channel), self._clock)
 
     def _passed(self, channel: int, kind: Kind, t_mono: float, payload: bytes) -> None:

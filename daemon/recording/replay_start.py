@@ -1,4 +1,4 @@
-"""Start of a replay within a recording: the stored state that it begins from."""
+"""Start of a replay within a recording: finds the checkpoint beside a segment and loads it into a cycle."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ CYCLE_PARTS: Final = (
     "period", "odometry", "imu", "cycles", "overruns", "verdict", "result", "observer", "_builder", "blocks", "lamps",
     "alarm", "trust", "inbox", "paused", "watch", "_left_out",
 )  # fmt: skip
-"""What a cycle remembers."""
+"""Attributes of `Cycle` that a checkpoint contains."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """A state on the disk.
+    """A checkpoint on the disk.
 
     Attributes:
-        path: of the file. t_mono: when it was taken. cycle: the last one before. line: what the lidar's line had said.
+        path: of the file. t_mono: time of the capture, s. cycle: the last one before it.
+        line: bytes of the lidar line that the codec needs, as records.
     """
 
     path: Path
@@ -41,10 +42,10 @@ class Moment:
     pieces: Iterator[Piece]
 
     def load(self) -> Restored:
-        """What is in it, once.
+        """Returns the content; works once.
 
         Raises:
-            DataInvalid: it was made by other software, or is damaged.
+            DataInvalid: other software made it, or it is damaged.
         """
         from daemon.recording.restore import CannotRestore, restore
         from daemon.recording.state_file import BadState
@@ -63,10 +64,10 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Restored:
-    """A state of estimator and cycle.
+    """A restored state of estimator and cycle.
 
     Attributes:
-        state: of the estimator. jobs: under way, by ID. rest: what the cycle and its parts remember.
+        state: estimator state. jobs: pending jobs by ID. rest: attributes of the cycle and its parts.
     """
 
     state: State
@@ -74,12 +75,12 @@ class Restored:
     rest: dict[str, Any]
 
     def keep_history(self) -> State:
-        """The state, which keeps from now on what a replay wants to know at its end."""
+        """Returns the state with its history enabled, which a replay reads at its end."""
         self.state.use(replace(self.state.settings, history=True))
         return self.state
 
     def put_into(self, cycle: Cycle) -> None:
-        """Let a cycle remember."""
+        """Sets the stored attributes of a cycle and its parts."""
         for name, value in self.rest["cycle"].items():
             setattr(cycle, name, value)
         for part, remembered in (
@@ -92,15 +93,15 @@ class Restored:
 
 
 def state_beside(segment: Path) -> Path:
-    """Path of a segment's state, whether it is there or not."""
+    """Returns the path of a segment's checkpoint, whether the file exists or not."""
     return segment.with_suffix(STATE_SUFFIX)
 
 
 def read_moment(path: Path) -> Moment:
-    """The state in a file.
+    """Returns the checkpoint in a file.
 
     Raises:
-        DataInvalid: it is none, or damaged. HalError: it cannot be read.
+        DataInvalid: the file is no checkpoint, or damaged. HalError: it cannot be read.
     """
     from daemon.recording.state_file import BadState, read_state
 
@@ -116,9 +117,12 @@ def read_moment(path: Path) -> Moment:
 
 
 def beginning(recording: Recording, until: float = -math.inf) -> Recording:
-    """The recording from its beginning on, or from the last state before ``until`` (t_mono) where that is later.
+    """Returns the recording from its beginning, or from the last checkpoint before ``until`` if that is later.
 
-    Its beginning is that of the run, or the first segment that has a state; without any it is the first segment.
+    ``until``: t_mono, s.
+
+    The beginning is the start of the run, or else the first segment with a checkpoint. Without any checkpoint it is the
+    first segment.
 
     Raises:
         DataInvalid: the run began before the first segment, and its states are of another format version.

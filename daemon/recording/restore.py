@@ -1,9 +1,9 @@
-"""Reads back what `daemon.recording.checkpoint` has taken: objects of the estimator and of the cycle, and nothing else.
+"""Reader of checkpoints: a restricted unpickler for objects of the estimator and the cycle, and for nothing else.
 
-A state file may come from anywhere: by mail, from a customer's robot. So not only what it names is limited, but also
-what it does with it (see :class:`_Reader`): nothing is called but what makes data, and only fields are set, of what the
-file itself has made. Classes, functions and members of enumerations are shared with the running program; they cannot
-be changed.
+A checkpoint may come from anywhere, for example by mail from a customer's robot. The reader therefore limits what a
+file names and also what it does (see :class:`_Reader`). It calls only what makes data. It sets only fields of objects
+that the file itself has made. Classes, functions and enumeration members belong to the running program and cannot be
+changed. `daemon.recording.checkpoint` writes the files.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ import numpy as np
 from estimator import Keyframe, Patch, ResidualMap, Settled, State, Submap, Survey
 
 WHOLE: Final = (Survey, ResidualMap, np.ndarray)
-"""Pieces that refer to nothing else."""
+"""Pieces that refer to no other piece."""
 FIXED: Final = (Keyframe, Settled, Patch)
 """Pieces that refer to others; they never change once something refers to them."""
 ROOT: Final = -1
-"""Number of the piece with all that is small."""
+"""Number of the piece with all small values."""
 ESTIMATOR: Final = "estimator."
 """Prefix of the estimator's modules."""
 SYSTEM: Final = frozenset(
@@ -51,7 +51,7 @@ PARTS: Final = frozenset(
         *("hal.adc", "hal.errors", "hal.imu", "hal.lidar", "hal.odometry"),
     )
 )
-"""Modules whose classes the cycle's memory consists of."""
+"""Modules whose classes the memory of the cycle consists of."""
 KNOWN: Final = {
     "builtins": {"set", "frozenset", "complex", "bytearray", "dict", "list", "object", "range", "slice"},
     "collections": {"deque", "Counter", "OrderedDict", "defaultdict"},
@@ -61,25 +61,26 @@ KNOWN: Final = {
     "numpy._core.multiarray": {"_reconstruct", "scalar"},
     "numpy._core.numeric": {"_frombuffer"},
 }
-"""What may be made besides classes of our own and functions of the estimator: nothing that reaches the system."""
+"""Further names that a file may use, besides our classes and functions of the estimator; none reaches the system."""
 _NOT_THERE: Final = object()
 PLAIN: Final = "biufcSU"
-"""Kinds of numpy arrays: no objects, no structures."""
+"""Kinds of numpy arrays allowed: no objects, no structures."""
 
 
 _REFUSED: Final = (
     *(pickle.UnpicklingError, AttributeError, ImportError, LookupError, TypeError, ValueError, EOFError),
     *(ArithmeticError, MemoryError, RecursionError, struct.error),
 )
-"""What reading a damaged or forged state may raise; numbers too large or cut in half lead to the last four."""
+"""Exceptions that a damaged or forged state may raise. Numbers that are too large or truncated lead to the last
+four."""
 
 
 class CannotRestore(Exception):
-    """What was kept was made by other software, or is damaged."""
+    """The checkpoint was made by other software, or is damaged."""
 
 
 class Piece(NamedTuple):
-    """One part of a checkpoint: its number, :data:`ROOT` for the last one; its class; its content, pickled."""
+    """One part of a checkpoint: number (:data:`ROOT` for the last one), class, and pickled content."""
 
     number: int
     kind: str
@@ -88,35 +89,35 @@ class Piece(NamedTuple):
 
 @lru_cache(maxsize=64)
 def field_names(kind: type) -> tuple[str, ...]:
-    """Names of a dataclass's fields; none of any other class."""
+    """Returns the names of a dataclass's fields; empty for any other class."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
 
 
-# what stands in a state by name: the writer refers to these, the reader calls them
+# functions that a checkpoint names: the writer refers to them, the reader calls them
 
 
 def piece_of(number: int) -> object:
-    """Stands for the reader's own in what is written."""
+    """Placeholder in the file for the piece lookup of the reader; never called."""
     raise AssertionError("pieces are looked up by their reader")
 
 
 def weak_set(content: Sequence[Any]) -> WeakSet[Any]:
-    """A set that does not keep its content alive."""
+    """Returns a set that does not keep its elements alive."""
     return WeakSet(content)
 
 
 def blank(kind: type) -> object:
-    """An object of one of our classes whose fields are yet to be filled."""
+    """Returns an object of one of our classes, with its fields not yet set."""
     if not _ours(kind):
         raise pickle.UnpicklingError(f"{kind!r} does not belong into a state")
     return object.__new__(kind)
 
 
 def fill(made: object, said: dict[str, Any]) -> None:
-    """Set fields of an object of one of our classes: these and nothing else of it.
+    """Sets the fields of an object of one of our classes, and nothing else of it.
 
     Raises:
-        UnpicklingError: it is something that others share, that is no field of it, or not all of its fields.
+        UnpicklingError: the object is shared, a name is not a field, or a field is missing.
     """
     kind: type = type(made)
     if isinstance(made, Enum) or not _ours(kind):
@@ -133,7 +134,11 @@ def fill(made: object, said: dict[str, Any]) -> None:
 def function_within(
     module: str, qualname: str, line: int, held: tuple[object, ...], defaults: tuple[object, ...] | None
 ) -> types.FunctionType:
-    """A function within another one, with what it holds."""
+    """Returns a nested function of the estimator with its closure and defaults.
+
+    Raises:
+        CannotRestore: the module has no such function at that line.
+    """
     if not _computes(module):
         raise CannotRestore(f"{module}.{qualname} does not belong into a state")
     space = import_module(module).__dict__
@@ -145,7 +150,7 @@ def function_within(
 
 
 def _code(within: object, qualname: str, line: int) -> types.CodeType | None:
-    """The code of a function somewhere within a function or a class."""
+    """Returns the code object of a nested function of a function or class; None if there is none."""
     if isinstance(within, type):
         inside: Sequence[object] = tuple(vars(within).values())
     elif isinstance(within, types.FunctionType):
@@ -160,7 +165,7 @@ def _code(within: object, qualname: str, line: int) -> types.CodeType | None:
 
 
 def _dtype(text: str, *_: object) -> np.dtype[Any]:
-    """A plain dtype; the one that all share, so it is never filled (:meth:`_Reader.build`)."""
+    """Returns a plain dtype. It is shared by all arrays, so :meth:`_Reader.build` never fills it."""
     found = np.dtype(str(text))
     if found.kind not in PLAIN or found.names is not None:
         raise pickle.UnpicklingError(f"arrays of {text!r} do not belong into a state")
@@ -168,7 +173,7 @@ def _dtype(text: str, *_: object) -> np.dtype[Any]:
 
 
 def _ours(kind: object) -> bool:
-    """Whether it is a class of the estimator or of what the cycle's memory consists of."""
+    """True for a class of the estimator or of the modules in :data:`PARTS`."""
     if not isinstance(kind, type):
         return False
     return kind.__module__ in PARTS or _computes(kind.__module__)
@@ -181,7 +186,7 @@ def _computes(module: str) -> bool:
 
 @lru_cache(maxsize=1024)
 def _is_field(kind: type, name: str) -> bool:
-    """Whether objects of a class have a field of that name: neither a method nor anything else of the class."""
+    """True if objects of a class have a field of that name; methods and other class attributes do not count."""
     if is_dataclass(kind):
         return name in field_names(kind)
     if not name.isidentifier() or name.startswith("__"):
@@ -205,15 +210,15 @@ _DATA: Final = frozenset(
         *(pickle.BINGET, pickle.LONG_BINGET, pickle.BINPUT, pickle.LONG_BINPUT, pickle.STACK_GLOBAL),
     )
 )
-"""What pickle's writer makes of data at protocol 5; the rest of its commands (instances of old, extensions, persistent
-names) has no place in a state."""
+"""Opcodes that pickle writes for data at protocol 5. Its other opcodes (old instances, extensions, persistent names)
+are refused in a checkpoint."""
 
 
 class _Reader(pickle._Unpickler):
-    """Reads; looks pieces up, and makes nothing but data and what computes with them.
+    """Restricted unpickler: looks pieces up, and makes only data and the functions that compute with them.
 
-    It is pickle's reader in Python, whose commands can be replaced: it calls (REDUCE, NEWOBJ) nothing but classes and
-    the few functions that make data, and it fills (BUILD) what has just been made, by :func:`fill`.
+    It derives from pickle's reader in Python, whose opcodes can be replaced. REDUCE and NEWOBJ call only classes and
+    the few functions that make data. BUILD fills only an object that the file has just made, by :func:`fill`.
     """
 
     stack: list[Any]
@@ -228,7 +233,10 @@ class _Reader(pickle._Unpickler):
         self._makers: set[int] = {id(pieces), id(_dtype), *map(id, HERE.values())}
 
     def find_class(self, module: str, name: str) -> Any:
-        """The class or function of that name, if it is one that a state consists of."""
+        """Returns the class or function of that name.
+
+        Raises UnpicklingError for a name that a checkpoint may not use.
+        """
         if module == __name__:
             return self._piece if name == piece_of.__name__ else HERE[name]
         if name in KNOWN.get(module, ()):
@@ -244,32 +252,32 @@ class _Reader(pickle._Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name} does not belong into a state")
 
     def reduce(self) -> None:
-        """REDUCE: call what makes data."""
+        """REDUCE: calls a class or function that makes data."""
         given = self.stack.pop()
         called = self.stack[-1]
         if not (_makes(called) or id(called) in self._makers):
             raise pickle.UnpicklingError(f"{called!r} is not called by a state")
         struct = isinstance(called, type) and issubclass(called, msgspec.Struct)
-        if struct and len(given) != len(called.__struct_fields__):  # by position: those left out would be made up
+        if struct and len(given) != len(called.__struct_fields__):  # by position: missing ones would get default values
             raise pickle.UnpicklingError(f"{called.__name__}: not all of its fields, or more")
         self.stack[-1] = called(*given)
 
     def newobj(self) -> None:
-        """NEWOBJ: a new object of a class."""
+        """NEWOBJ: makes a new object of a class."""
         given, kind = self.stack.pop(), self.stack.pop()
         if not _makes(kind):
             raise pickle.UnpicklingError(f"{kind!r} makes nothing in a state")
         self.append(kind.__new__(kind, *given))
 
     def newobj_ex(self) -> None:
-        """NEWOBJ_EX: the same with named arguments."""
+        """NEWOBJ_EX: makes a new object of a class with named arguments."""
         named, given, kind = self.stack.pop(), self.stack.pop(), self.stack.pop()
         if not _makes(kind):
             raise pickle.UnpicklingError(f"{kind!r} makes nothing in a state")
         self.append(kind.__new__(kind, *given, **named))
 
     def build(self) -> None:
-        """BUILD: fill what has been made."""
+        """BUILD: fills the object that was just made."""
         said = self.stack.pop()
         made = self.stack[-1]
         if isinstance(made, np.dtype):
@@ -285,17 +293,17 @@ class _Reader(pickle._Unpickler):
 
 
 def _makes(kind: object) -> bool:
-    """Whether it is a class that makes data; numpy has functions of its own for its arrays."""
+    """True for a class that makes data; numpy makes its arrays by functions of its own."""
     return isinstance(kind, type) and kind is not np.ndarray
 
 
 def _sized(made: np.dtype[Any], said: Any) -> bool:
-    """Whether this is what numpy says of a text's dtype, whose size is part of it."""
+    """True for numpy's state of a text dtype, whose size is part of the state."""
     return made.kind in "SU" and said[1:5] == (made.str[0], None, None, None) and said[5] == made.itemsize
 
 
 def _said_of(kind: type, said: Any) -> dict[str, Any]:
-    """Fields by name, however pickle keeps them: as a list by a frozen dataclass, apart by a class with slots."""
+    """Returns the fields by name. Pickle stores a frozen dataclass as a list, and a class with slots as a pair."""
     if isinstance(said, list):
         return dict(zip(field_names(kind), said, strict=True))
     if isinstance(said, tuple):
@@ -305,10 +313,10 @@ def _said_of(kind: type, said: Any) -> dict[str, Any]:
 
 
 def restore(pieces: Iterator[Piece]) -> tuple[State, dict[str, Any]]:
-    """The state and the rest, as they were taken.
+    """Returns the state and the rest, as they were captured.
 
     Raises:
-        CannotRestore: they were taken by other software, or are damaged.
+        CannotRestore: other software captured them, or they are damaged.
     """
     try:
         return _restored(pieces)

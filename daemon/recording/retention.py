@@ -1,9 +1,9 @@
-"""Retention of a recording's segments: states beside them, removal of the oldest, dumps. Runs in its own thread.
+"""Retention of a recording: writes checkpoints, removes the oldest segments, and makes dumps. Runs in its own thread.
 
-A recording can be replayed from its beginning, and from every segment with a state beside it. What is taken away is
-therefore everything before such a segment, and never the last of them. A dump is a folder of links to the segments that
-are there: it costs next to nothing until the ring goes on without them. Then it holds their room: where the disk has
-too little, dumps go first, and after them segments, whose room a dump may hold.
+A replay can start at the beginning of a recording, and at every segment with a checkpoint. Retention therefore removes
+everything before such a segment, and never the last of them. A dump is a folder of links to the present segments. It
+costs next to nothing until the ring removes them; from then on it occupies their room. If the disk has too little
+room, dumps are removed first. Segments are removed after them, because a dump may hold their room.
 """
 
 from __future__ import annotations
@@ -38,40 +38,40 @@ if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
 log = logging.getLogger(__name__)
 
 DUMP: Final = "dump-"
-"""Folders of dumps are named so, by the time."""
+"""Prefix of the folders of dumps; the time follows."""
 ABOUT: Final = "dump.json"
 DUMPS: Final = 8
-"""Dumps that are kept because of faults and of runs that died, the latest."""
+"""Number of latest dumps kept after faults and after runs that died."""
 ASKED: Final = "asked"
-"""Reason of a dump that somebody has asked for."""
+"""Reason of a requested dump."""
 ASKED_DUMPS: Final = 4
-"""Such dumps that are kept: whoever asks again and again does not push those of faults out."""
+"""Number of requested dumps kept; repeated requests do not displace those of faults."""
 DUMP_S: Final = 600.0
-"""What a dump of a recording that is kept as a whole reaches back."""
+"""Time that a dump of a whole recording reaches back, s."""
 MAP_SUFFIX: Final = ".lumimap"
-"""Of the map that the run began with, and of those that it went on in."""
+"""Suffix of the initial map, and of the maps that the run switched to."""
 SWITCHED: Final = f"switch-*{MAP_SUFFIX}"
-"""The latter; each is needed as long as the cycle is there that took it."""
+"""Pattern of the maps that the run switched to; each is needed as long as the cycle that loaded it is kept."""
 SWITCH_S: Final = 60.0
-"""From a map's file to the cycle that takes it, at most."""
+"""Longest time from writing a map's file to the cycle that loads it, s."""
 RING: Final = "ring"
-"""File of a ring's folder, locked while somebody writes; empty until the run has ended as it should."""
+"""File in a ring's folder, locked during the run; empty until the run has ended as intended."""
 MB_A_MINUTE: Final = 24
-"""What a ring may hold at most, twice what a lidar of 1081 beams at 40 Hz and a photodiode make."""
+"""Upper limit of a ring, MB/min: twice the data of a lidar with 1081 beams at 40 Hz and a photodiode."""
 LEAST_BYTES: Final = 256 << 20
-"""A ring may hold that much in any case: maps may be large."""
+"""Smallest upper limit of a ring, bytes: maps may be large."""
 RESERVE_BYTES: Final = 512 << 20
-"""Room that a recording leaves on its disk: the maps have to go there, too."""
+"""Room that a recording leaves on its disk, bytes; maps are stored there, too."""
 BREATH_S: Final = 0.0005
-"""Pause between two slices of pickling."""
+"""Pause between two slices of pickling, s."""
 CLOSE_S: Final = 5.0
 
 
 class Begun(NamedTuple):
-    """A segment that was begun with a state: the state, the lines it needs, and what is said of it.
+    """A segment that begins with a checkpoint: the captured state, the lidar line, and the header.
 
     Attributes:
-        t_mono: when the state was taken, s of the monotonic clock. taken: None where there is none to be had.
+        t_mono: time of the capture, s. taken: captured state; None if there is none.
     """
 
     number: int
@@ -83,7 +83,7 @@ class Begun(NamedTuple):
 
 @dataclass(slots=True)
 class _Segment:
-    """A segment that is there; ``t_mono``: when it began, where a state begins it."""
+    """A present segment; ``t_mono``: its start, s, if it begins with a checkpoint."""
 
     bytes: int = 0
     t_mono: float = math.nan
@@ -91,15 +91,15 @@ class _Segment:
 
 
 class Flight:
-    """The keeper of one recording's folder.
+    """Manages the folder of one recording.
 
     Attributes:
-        error: what of the latest state or dump could not be kept, empty while all is well.
-        state_bytes: of the latest state. dumps: written so far.
+        error: why the latest checkpoint or dump could not be stored; empty without trouble.
+        state_bytes: size of the latest checkpoint. dumps: written so far.
     """
 
     def __init__(self, folder: Path, keep_s: float = math.inf) -> None:
-        """``keep_s``: how far back the recording reaches at least; infinite: as far as the disk has room."""
+        """``keep_s``: least time that the recording reaches back, s; infinite: as far as the disk has room."""
         self.error = ""
         self.state_bytes = self.dumps = 0
         self._folder = folder
@@ -107,7 +107,7 @@ class Flight:
         self._most = math.inf if math.isinf(keep_s) else max(LEAST_BYTES, (MB_A_MINUTE << 20) * keep_s / 60.0)
         self._segments: dict[int, _Segment] = {0: _Segment(t_mono=-math.inf, state=True)}
         self._said_full = self._owed = False
-        self._made: Path | None = None  # the newest dump, as far as is known
+        self._made: Path | None = None  # the newest dump, None if not known
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._ring = -1
         self._mark_ring()
@@ -115,35 +115,35 @@ class Flight:
         self._thread.start()
 
     def _mark_ring(self) -> None:
-        """Mark the folder as a ring, where it is to be one: at the start, or once there is a folder."""
+        """Marks the folder as a ring where it is one: at the start, or once the folder exists."""
         if self._ring < 0 and not math.isinf(self._keep_s):
-            with contextlib.suppress(OSError):  # the recording itself says what is wrong with the disk
+            with contextlib.suppress(OSError):  # the recording itself reports errors of the disk
                 self._ring, self._made = _begin_ring(self._folder)
 
     def prepare(self) -> None:
-        """The estimator has been loaded; what is still missing is loaded here, and not within a cycle."""
+        """Loads the remaining modules after the estimator, so that no cycle has to."""
         self._tasks.put(_load)
 
     def closed(self, number: int, path: Path) -> None:
-        """A segment is complete."""
+        """Counts the bytes of a complete segment."""
         self._tasks.put(partial(self._take_away, number, path))
 
     def begun(self, begun: Begun) -> None:
-        """A segment was begun; its state is to be written."""
+        """Queues the checkpoint of a new segment for writing."""
         self._tasks.put(partial(self._keep, begun))
 
     def dump(self, about: dict[str, Any], on_done: OnDone) -> None:
-        """Link what there is; ``on_done``: empty, or why that came to nothing. Called in this thread of its own."""
+        """Makes a dump; ``on_done``: called in the retention thread with an empty text or the error."""
         self._tasks.put(partial(self._dump, about, on_done))
 
     def close(self, ended: bool) -> None:
-        """Finish what was asked for, for so long. ``ended``: as it should; else the next start keeps it as a dump.
+        """Finishes pending work, for at most :data:`CLOSE_S`. ``ended``: the run ended as intended.
 
-        So it does where a dump was asked for, and is not there: the ring is all there is of it.
+        Otherwise, or if a requested dump is missing, the next start keeps the ring as a dump: only it has the data.
         """
         self._tasks.put(None)
         self._thread.join(CLOSE_S)
-        if self._thread.is_alive():  # it still writes: the ring stays locked for as long as it may
+        if self._thread.is_alive():  # it still writes: the ring stays locked until it has finished
             log.warning("%s: not everything is written yet; the next start keeps it as a dump", self._folder)
             return
         if self._ring >= 0:
@@ -154,18 +154,18 @@ class Flight:
             self._ring = -1
 
     def _work(self) -> None:
-        with contextlib.suppress(OSError, AttributeError):  # the cycle goes first wherever both want the processor
+        with contextlib.suppress(OSError, AttributeError):  # the cycle has precedence on a busy processor
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
         while (task := self._tasks.get()) is not None:
             try:
                 self._mark_ring()
                 task()
-            except Exception:  # a defect here must not end the recording, and is told in full
+            except Exception:  # a defect here must not end the recording; it is logged in full
                 log.exception("the recording's folder cannot be looked after")
                 self.error = "a defect, see the log"
 
     def _keep(self, begun: Begun) -> None:
-        """Write a state, and take away what is too old."""
+        """Writes a checkpoint and removes what is too old."""
         segment = self._segments.setdefault(begun.number, _Segment())
         segment.t_mono = begun.t_mono
         if begun.taken is None:
@@ -201,10 +201,10 @@ class Flight:
             self._segments.setdefault(number, _Segment()).bytes += path.stat().st_size
 
     def _prune(self, now: float) -> None:
-        """Take away what is older than asked for, and then what there is no room for, dumps before segments.
+        """Removes what is older than configured, then what has no room: dumps before segments.
 
-        Where states cannot be had, a ring that holds twice what it may goes on without a beginning: it must not fill
-        the disk that the maps go to.
+        If no checkpoint can be made, a ring of twice its limit continues without its beginning. It must not fill the
+        disk that stores the maps.
         """
         starts = [number for number, segment in sorted(self._segments.items()) if segment.state]
         old = [number for number in starts if self._segments[number].t_mono <= now - self._keep_s]
@@ -221,7 +221,7 @@ class Flight:
         return sum(segment.bytes for segment in self._segments.values())
 
     def _lacking(self) -> int:
-        """Bytes of room that are missing on the disk; not more than 0: none."""
+        """Returns the room that is missing on the disk, bytes; 0 or less if none is missing."""
         try:
             room = shutil.disk_usage(self._folder).free
         except OSError:
@@ -233,9 +233,9 @@ class Flight:
         return RESERVE_BYTES - room
 
     def _lacks_room(self) -> bool:
-        """Whether room is missing though dumps were taken away; what was theirs may be free only later."""
+        """Removes dumps if room is missing; True if it still is. The disk may free their room only later."""
         lacking = self._lacking()
-        with contextlib.suppress(OSError):  # a dump that cannot be taken away: then it is the recording's turn
+        with contextlib.suppress(OSError):  # a dump that cannot be removed: segments are removed instead
             for dump in _spare_dumps(self._folder.parent, self._made) if lacking > 0 else ():
                 held = _held_alone(dump)
                 shutil.rmtree(dump)
@@ -254,7 +254,7 @@ class Flight:
             for name in (segment_name(number), state_name(number)):
                 with contextlib.suppress(OSError):
                     (self._folder / name).unlink(missing_ok=True)
-        for path in self._folder.glob(SWITCHED):  # a robot on a lift goes from map to map all day
+        for path in self._folder.glob(SWITCHED):  # a robot that uses a lift switches maps all day
             with contextlib.suppress(OSError):
                 if path.stat().st_mtime < ended - SWITCH_S:
                     path.unlink()
@@ -263,12 +263,12 @@ class Flight:
         reason = "a defect, see the log"
         try:
             reason = self._dumped(about)
-        finally:  # whoever has asked hears of it, whatever has happened
+        finally:  # the client gets a result in every case
             self._owed = bool(reason)
             on_done(reason)
 
     def _dumped(self, about: dict[str, Any]) -> str:
-        """Make a dump; empty, or why there is none."""
+        """Makes a dump; returns an empty text, or the reason of the failure."""
         name = f"{DUMP}{about['at']}-{about['reason']}"
         try:
             names = self._names(self._dump_from(float(about["t_mono"])))
@@ -283,14 +283,14 @@ class Flight:
         return ""
 
     def _dump_from(self, now: float) -> int:
-        """The segment a dump begins with."""
+        """Returns the number of the first segment of a dump."""
         reach = min(self._keep_s, DUMP_S) if math.isinf(self._keep_s) else self._keep_s
         starts = [number for number, segment in sorted(self._segments.items()) if segment.state]
         old = [number for number in starts if self._segments[number].t_mono <= now - reach]
         return old[-1] if old else min(starts, default=0)
 
     def _names(self, begin: int) -> list[str]:
-        """Files of a dump; the segment that is being written is one of them, whatever is known of it here."""
+        """Returns the file names of a dump; the segment that is being written is one of them."""
         there = sorted(path.name for path in self._folder.iterdir())
         names = [name for suffix in (SUFFIX, STATE_SUFFIX) for name in there if _numbered(name, suffix) >= begin]
         maps = [name for name in there if name.endswith(MAP_SUFFIX) and not (name == START and begin > 0)]
@@ -298,7 +298,7 @@ class Flight:
 
 
 def _numbered(name: str, suffix: str) -> int:
-    """Number of a segment's or a state's file, -1 where it is none."""
+    """Returns the number of a segment or checkpoint file; -1 for any other file."""
     stem = name.removesuffix(suffix)
     return int(stem) if stem != name and stem.isdecimal() else -1
 
@@ -308,7 +308,7 @@ def _load() -> None:
 
 
 def _linked(source: Path, names: list[str], target: Path, about: dict[str, Any]) -> Path:
-    """A folder with links to these files, or copies where links are not possible; appears whole."""
+    """Makes a folder with links to the files, or copies where links are impossible; it appears as a whole."""
     target = _free(target)
     beside = target.with_name(f".{target.name}.part")
     beside.mkdir(parents=True)
@@ -336,10 +336,7 @@ def _free(path: Path) -> Path:
 
 
 def _prune_dumps(parent: Path, made: Path) -> None:
-    """Remove the oldest by their names, never the one just ``made``: the clock may not have been set yet.
-
-    Those that were asked for and the others do not count together.
-    """
+    """Removes the oldest dumps by name, requested ones separately; keeps ``made``, as the clock may not be set."""
     asked = _was_asked(made)
     others = sorted(path for path in parent.glob(f"{DUMP}*") if path != made and _was_asked(path) == asked)
     for old in others[: 1 - (ASKED_DUMPS if asked else DUMPS)]:
@@ -347,10 +344,10 @@ def _prune_dumps(parent: Path, made: Path) -> None:
 
 
 def _spare_dumps(parent: Path, made: Path | None) -> list[Path]:
-    """Dumps that may go where there is no room, by when they were made; those that were asked for are the last.
+    """Returns the dumps that may be removed to make room, oldest first and requested ones last.
 
-    The newest is none of them: that is the one ``made`` by this run, or else the last to the clock, which may have been
-    set meanwhile.
+    The newest dump is never among them: the one ``made`` by this run, or else the last by a clock that may have been
+    set.
     """
     dumps = sorted((path.stat().st_mtime, path.name, path) for path in parent.glob(f"{DUMP}*") if path.is_dir())
     newest = made if made is not None and made.exists() else dumps[-1][2] if dumps else None
@@ -358,7 +355,7 @@ def _spare_dumps(parent: Path, made: Path | None) -> list[Path]:
 
 
 def _held_alone(dump: Path) -> int:
-    """Bytes on the disk that nothing but this dump holds."""
+    """Returns the bytes on the disk that only this dump occupies."""
     return sum(512 * one.st_blocks for one in map(Path.stat, dump.iterdir()) if one.st_nlink == 1)
 
 
@@ -367,7 +364,10 @@ def _was_asked(dump: Path) -> bool:
 
 
 def _begin_ring(folder: Path) -> tuple[int, Path | None]:
-    """Mark a folder as a ring that is being written, and see to those that earlier runs have left; a dump of them."""
+    """Marks a folder as an active ring and handles the rings of earlier runs.
+
+    Returns the lock and the dump made of one.
+    """
     made = None
     for other in sorted(folder.parent.glob(f"*/{RING}")):
         if other.parent != folder:
@@ -378,7 +378,7 @@ def _begin_ring(folder: Path) -> tuple[int, Path | None]:
 
 
 def _see_to(mark: Path) -> Path | None:
-    """A ring of an earlier run: nobody needs it if that run has ended as it should; else it is a dump from now on."""
+    """Handles the ring of an earlier run: removes it after an intended end, otherwise makes it a dump."""
     kept: Path | None = None
     try:
         with mark.open("rb") as file:
@@ -387,7 +387,7 @@ def _see_to(mark: Path) -> Path | None:
                 shutil.rmtree(mark.parent, ignore_errors=True)
                 return None
         kept = mark.parent
-        if not kept.name.startswith(DUMP):  # else it was moved, and the power went before its mark did
+        if not kept.name.startswith(DUMP):  # otherwise it was moved, and a power cut left its mark
             kept = _free(mark.parent.with_name(f"{DUMP}{mark.parent.name}-died"))
             mark.parent.rename(kept)
         (kept / RING).unlink()

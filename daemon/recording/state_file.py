@@ -1,10 +1,10 @@
-"""State files: what the replay of a recording needs that begins in its middle. One lies beside the segment it is for.
+"""Checkpoint file format (``.lumistate``): stores the state beside the segment from which a replay can start.
 
 ``NNNNNN.lumistate``, little-endian: ``LUMISTAT``, format version (u16), length of the header (u32), the header (JSON),
-CRC-32 of all that (u32); then blocks, each with the length of its content (u32), CRC-32 of that (u32), and the content,
-deflated: a msgpack array of pieces ``[number, kind, content]``. The pieces are those of `daemon.recording.checkpoint`,
-the last one its root. Before them comes one of number -2: what the lidar's line had said that its codec must know, as
-records.
+CRC-32 of all that (u32). Then follow blocks, each with the length of its content (u32), CRC-32 of that (u32), and the
+deflated content: a msgpack array of pieces ``[number, kind, content]``. `daemon.recording.checkpoint` defines the
+pieces; the root is the last one. The first piece has the number -2. It contains the bytes of the lidar line that the
+codec needs, as records.
 """
 
 from __future__ import annotations
@@ -55,7 +55,9 @@ def write_state(
     pieces: Iterable[Piece],
     breathe: Callable[[], object] = lambda: None,
 ) -> int:
-    """Write a state file, whole or not at all; ``breathe`` is called after every few pieces. Returns its bytes.
+    """Writes a checkpoint file, whole or not at all, and returns its size in bytes.
+
+    ``breathe`` is called after every :data:`SLICE` pieces.
 
     Raises:
         OSError: it cannot be written. CannotTake: a piece cannot be pickled.
@@ -98,7 +100,7 @@ def _blocks(ready: list[Piece], pieces: Iterable[Piece], breathe: Callable[[], o
 
 
 SLICE: Final = 16
-"""Pieces pickled in one go: some 0.2 ms."""
+"""Pieces pickled in one slice: some 0.2 ms."""
 
 
 def _packed(pieces: list[Piece]) -> bytes:
@@ -107,7 +109,7 @@ def _packed(pieces: list[Piece]) -> bytes:
 
 
 def read_state(path: Path) -> tuple[dict[str, Any], bytes, Iterator[Piece]]:
-    """The header, what the lidar's line had said, and the pieces.
+    """Returns the header, the bytes of the lidar line, and the pieces.
 
     Raises:
         OSError: it cannot be read. BadState: it is damaged. OtherVersion: of another version.
@@ -122,7 +124,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], bytes, Iterator[Piece]]:
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """The header alone; raises as :func:`read_state` does."""
+    """Returns the header alone; raises as :func:`read_state` does."""
     with path.open("rb") as file:
         return _header(path, file.read(1 << 20))[0]
 

@@ -1,1 +1,1 @@
-"""Logs and recordings through the daemon's own cycle on a virtual clock."""
+"""Replay of logs and recordings through the daemon's cycle in virtual time, and the results as files."""

@@ -1,6 +1,6 @@
-"""Recorded lidar data of other formats as CARMEN logs that `lumiloop replay` reads.
+"""Converter of recorded lidar data in other formats to CARMEN logs for `lumiloop replay`.
 
-The input is recognised by its content:
+The content of the input determines its format:
 
 * the ``.dat`` files of CoreSLAM/BreezySLAM (``.gz`` too): a HOKUYO URG-04LX on a rover with wheel encoders, one scan a
   line: [0] time in us, [2] [3] encoder counts left and right, [24..705] 682 ranges in mm from step 44 to 725, 0 where
@@ -8,8 +8,8 @@ The input is recognised by its content:
 * an ``.npz`` with ``t_device_s``, ``range_mm``, ``angle_min_rad``, ``angle_increment_rad``, ``time_increment_s``: scans
   of a HOKUYO UTM-30LX.
 
-The log gets ROBOTLASER1 lines with start angle, field of view and resolution, and PARAM lines for what such a line
-cannot say: the mount, the model, its ranges, the time of a revolution and between beams.
+The log gets ROBOTLASER1 lines with start angle, field of view and resolution. PARAM lines contain what such a line has
+no field for: the mount, the model, its ranges, the scan period and the time between beams.
 """
 
 from __future__ import annotations
@@ -40,19 +40,20 @@ ROVER_HIDDEN_BEAMS: Final = 70
 ROVER_TRUSTED_MM: Final = 4000
 UTM_STEPS: Final = 1440
 DELAY_S: Final = 0.12
-"""First beam to arrival: where wheels and scans of exp1 and exp2 agree best about every turn (0.66 and 0.74 deg RMS
-against 1.70 and 1.82 with the host's stamps)."""
+"""Delay from the first beam to the arrival, s: odometry and scans of exp1 and exp2 agree best with it about every turn.
+The RMS is 0.66 and 0.74 deg, against 1.70 and 1.82 with the host's stamps.
+"""
 MOTOR_TOLERANCE: Final = 0.03
 PERIODS_TRIED: Final = 6001
 
 
 class NotConverted(Exception):
-    """The input cannot be converted; the text names the file, the place, and what is expected."""
+    """The input cannot be converted; the text names the file, the place, and the expected content."""
 
 
 @dataclass(frozen=True)
 class Laser:
-    """What the log says about its laser: angles in rad, ranges in mm, times in s."""
+    """Lidar parameters of the log: angles in rad, ranges in mm, times in s."""
 
     model: str
     start: float
@@ -66,7 +67,7 @@ class Laser:
 
 @dataclass(frozen=True)
 class Scans:
-    """Stamps (n,) in s, ranges (n, beams) in mm, poses (n, 3) of the robot by its wheels."""
+    """Stamps (n,) in s, ranges (n, beams) in mm, robot poses (n, 3) by odometry in m, m, rad."""
 
     laser: Laser
     stamps: Array
@@ -75,7 +76,11 @@ class Scans:
 
 
 def read(path: Path) -> Scans:
-    """Read any of the known formats; raises `NotConverted`."""
+    """Reads any of the known formats.
+
+    Raises:
+        NotConverted: the file cannot be read, or is empty.
+    """
     try:
         with path.open("rb") as file:
             begin = file.read(4)
@@ -87,7 +92,7 @@ def read(path: Path) -> Scans:
 
 
 def read_dat(path: Path) -> Scans:
-    """A ``.dat`` file as logged: every range, stamps of the host, wheel poses at those stamps."""
+    """Returns a ``.dat`` file as logged: every range, stamps of the host, odometry poses at those stamps."""
     rows = np.array(list(_fields(path)))
     laser = Laser(
         model="URG-04LX",
@@ -120,7 +125,7 @@ def _fields(path: Path) -> Iterator[list[float]]:
 
 
 def wheel_poses(counts: Array) -> Array:
-    """(n, 3) poses of the middle of the axle from (n, 2) cumulative counts left and right; arcs, not chords."""
+    """Returns (n, 3) poses of the middle of the axle from (n, 2) cumulative counts left and right; arcs, not chords."""
     left, right = np.diff(counts * ROVER_COUNT_M, axis=0, prepend=counts[:1] * ROVER_COUNT_M).T
     way, turn = (left + right) / 2.0, (right - left) / (2.0 * ROVER_HALF_TRACK_M)
     yaw = np.cumsum(turn)
@@ -130,7 +135,7 @@ def wheel_poses(counts: Array) -> Array:
 
 
 def read_npz(path: Path) -> Scans:
-    """An ``.npz`` file of UTM-30LX scans; there are no wheels in it."""
+    """Returns an ``.npz`` file of UTM-30LX scans; it has no odometry."""
     names = ("t_device_s", "range_mm", "angle_min_rad", "angle_increment_rad", "time_increment_s")
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
@@ -144,10 +149,10 @@ def read_npz(path: Path) -> Scans:
 
 
 def even_stamps(scans: Scans, delay: float) -> Scans:
-    """Put each scan at its own turn of the motor instead of at its arrival, and the wheels' pose at that instant.
+    """Replaces the arrival stamp of each scan by the instant of its motor revolution, and interpolates the pose there.
 
-    The motor turns evenly, the host does not listen evenly: an arrival tells which turn it was, all of them together
-    tell when the turns were. ``delay`` is from the first beam of a scan to its mean arrival, s.
+    The motor turns evenly, but the host receives unevenly. An arrival identifies its revolution; all arrivals together
+    determine the instants of the revolutions. ``delay``: from the first beam of a scan to its mean arrival, s.
     """
     period, first = _rhythm(scans.stamps)
     turns = _turns((scans.stamps - first) / period)
@@ -160,7 +165,7 @@ def even_stamps(scans: Scans, delay: float) -> Scans:
 
 
 def _rhythm(stamps: Array) -> tuple[float, float]:
-    """Period and an instant of the regular grid that the arrivals lie closest to (the peak of their periodogram)."""
+    """Returns period and one instant, s, of the regular grid closest to the arrivals (peak of their periodogram)."""
     usual = float(np.median(np.diff(stamps)))
     late = stamps - stamps[0]
     periods = usual * np.linspace(1.0 - MOTOR_TOLERANCE, 1.0 + MOTOR_TOLERANCE, PERIODS_TRIED)
@@ -170,7 +175,7 @@ def _rhythm(stamps: Array) -> tuple[float, float]:
 
 
 def _turns(late: Array) -> Array:
-    """Whole, rising turns nearest to ``late``; of a burst of arrivals, those before the last are the late ones."""
+    """Returns rising whole revolutions nearest to ``late``; in a burst of arrivals, those before the last are late."""
     turns = np.rint(late)
     for k in range(len(turns) - 2, -1, -1):
         turns[k] = min(turns[k], turns[k + 1] - 1.0)
@@ -178,7 +183,7 @@ def _turns(late: Array) -> Array:
 
 
 def trusted(scans: Scans, hidden: int, farthest: int) -> Scans:
-    """Without ``hidden`` beams at either end (the rover itself) and without ranges beyond ``farthest`` mm."""
+    """Removes ``hidden`` beams at either end (they hit the rover itself) and ranges beyond ``farthest`` mm."""
     ranges = scans.ranges.copy()
     ranges[:, :hidden] = 0
     ranges[:, ranges.shape[1] - hidden :] = 0
@@ -187,7 +192,11 @@ def trusted(scans: Scans, hidden: int, farthest: int) -> Scans:
 
 
 def write(path: Path, scans: Scans, source: str) -> None:
-    """Write the log, gzipped if the name says so; raises `NotConverted`."""
+    """Writes the log, gzipped if the name ends with ``.gz``.
+
+    Raises:
+        NotConverted: the file cannot be written.
+    """
     text = ("\n".join(_lines(scans, source)) + "\n").encode()
     try:
         path.write_bytes(gzip.compress(text, 5, mtime=0) if path.suffix == ".gz" else text)
@@ -214,7 +223,7 @@ def _lines(scans: Scans, source: str) -> Iterator[str]:
 
 
 def _parameters(laser: Laser) -> dict[str, str]:
-    """CARMEN's own parameters where it has them, ours for the rest (`hal.replay.carmen_scans`)."""
+    """Returns CARMEN's own parameters where they exist, and ours for the rest (`hal.replay.carmen_scans`)."""
     x, y, yaw = laser.mount
     return {
         "robot_frontlaser_offset": f"{x:.6f}",
@@ -228,9 +237,12 @@ def _parameters(laser: Laser) -> dict[str, str]:
 
 
 def convert(source: Path, log: Path, logged: bool = False, delay: float = DELAY_S, every: bool = False) -> Scans:
-    """Convert a file to a CARMEN log and return what was written; raises `NotConverted`.
+    """Converts a file to a CARMEN log and returns the scans that were written.
 
-    Of a rover's log the scans get even stamps, unless ``logged``, and lose beams that see the rover, unless ``every``.
+    Scans of a rover's log get even stamps, unless ``logged``. They lose beams that hit the rover, unless ``every``.
+
+    Raises:
+        NotConverted: the input cannot be read, or the log cannot be written.
     """
     scans = read(source)
     if scans.laser.model == "URG-04LX":

@@ -1,4 +1,4 @@
-"""Runs a log through the daemon's own pipeline, as fast as it goes."""
+"""Replay of one log from opening to outcome, through the daemon's own pipeline or another method."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from daemon.system import console
 from estimator.paper import LUMILOOP
 from hal.errors import HalError
 
-if TYPE_CHECKING:  # loaded only where somebody asks for matches
+if TYPE_CHECKING:  # loaded only if matches are requested
     from daemon.replay.match_journal import MatchJournal
 
 PROGRESS_S: Final = 1.0
@@ -26,7 +26,7 @@ PROGRESS_S: Final = 1.0
 
 @dataclass(slots=True)
 class Outcome:
-    """What a run over a log has come to; ``stopped`` says why it ended before the log did, empty otherwise."""
+    """Outcome of a replay; ``stopped``: why it ended before the log did, empty otherwise."""
 
     source: Source
     config: Config
@@ -43,17 +43,17 @@ def replay(
     journal: MatchJournal | None = None,
     method: str = LUMILOOP,
 ) -> Outcome:
-    """Run a log through the pipeline, or through another method.
+    """Replays a log through the pipeline, or through another method.
 
     Args:
         path: the log.
         config: resolved configuration.
-        given: what of it a person has asked for; what nobody asked for is taken from a log that knows it.
-        journal: which matches are kept to be looked at.
+        given: the part of it that the operator has set; the log supplies the rest where it contains it.
+        journal: matches to keep for inspection.
         method: name of the method, see `estimator.paper.METHODS`.
 
     Raises:
-        HalError: the log cannot be opened; what goes wrong later ends the run and is said in `Outcome.stopped`.
+        HalError: the log cannot be opened. Later errors end the run and are in `Outcome.stopped`.
     """
     begun = time.perf_counter()
     console.progress(f"replay: reading {path}")
@@ -82,7 +82,7 @@ def replay(
 
 
 def _load_method(source: Source, given: Given, method: str) -> None:
-    """Load the kernels of another method than the daemon's, and note the map that it begins without."""
+    """Loads the kernels of another method than the daemon's, and notes that it begins without a stored map."""
     warmup.load_aloud(console.say, "warm-methods", warmup.load, "estimator.paper.methods")
     if source.begin is not None or MAP in source.header or any(key.startswith("map.") for key in given.keys):
         source.report.notes.append(f"method {method} begins with an empty map: a stored map or state is not used")

@@ -1,6 +1,6 @@
-"""`lumiloop replay --journal`: single matches of a run as data, every iteration of them, and as pictures.
+"""Match journal of a replay (`lumiloop replay --journal`): single matches with every iteration, as JSON and pictures.
 
-The format is described in docs/replay.md; a change of meaning changes :data:`VERSION`.
+docs/replay.md describes the format; a change of meaning changes :data:`VERSION`.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from estimator import (
 FORMAT: Final = "lumiloop-match"
 VERSION: Final = 1
 MOST: Final = 100
-"""Matches that may be asked for by number in one run: each is a few hundred kilobytes."""
+"""Matches that may be requested by number in one run: each takes a few hundred kilobytes."""
 MOST_FAILED: Final = 20
-"""Matches without a result that are written; the others are counted."""
+"""Failed matches that are written; further ones are only counted."""
 FAILED: Final = "failed"
 OURS: Final = re.compile(r"match-[1-9][0-9]*\.(json|png)")
-"""Names of the files that are written."""
+"""Names of the written files."""
 
 UNITS: Final = {"length": "m", "angle": "rad", "time": "s", "information": "1/m^2, 1/(m rad), 1/rad^2"}
 FRAMES: Final = {
@@ -55,16 +55,17 @@ FRAMES: Final = {
 
 
 class BadChoice(Exception):
-    """What was given for ``--journal`` cannot be meant; the text says why."""
+    """The value of ``--journal`` is invalid; the text gives the reason."""
 
 
 @dataclass(slots=True)
 class Choice:
-    """Which matches are wanted, counted from 1 in the order in which they were made.
+    """Selection of matches, counted from 1 in the order in which they were made.
 
     Attributes:
-        numbers: these. seconds: the first at or after each of these, since the log's first event. failed: those that
-            are no result.
+        numbers: these. seconds: the first at or after each of these, since the log's first event. failed: those without
+        a
+            result.
     """
 
     numbers: frozenset[int] = frozenset()
@@ -73,7 +74,7 @@ class Choice:
 
 
 def choice_of(words: str | None, seconds: float | None) -> Choice:
-    """From the command line.
+    """Returns the selection given on the command line.
 
     Raises:
         BadChoice: not a list of numbers from 1, nor ``failed``; or more than :data:`MOST`.
@@ -92,11 +93,11 @@ def choice_of(words: str | None, seconds: float | None) -> Choice:
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """What a match is called.
+    """Identification of a match.
 
     Attributes:
         match: its number. seconds: of its scan, since the log's first event. pose, stamp: number of its pose among
-            those of ``trajectory.tum``, from 1, and the stamp there; None where its cycle gave no pose.
+            those of ``trajectory.tum``, from 1, and the stamp there; None if its cycle gave no pose.
     """
 
     match: int
@@ -105,7 +106,7 @@ class Named:
     stamp: float | None
 
     def __str__(self) -> str:
-        """For people."""
+        """Text for the operator."""
         if self.pose is None:
             return f"match {self.match} (no pose)"
         return f"match {self.match} (pose {self.pose} of trajectory.tum, stamp {self.stamp:.6f})"
@@ -113,13 +114,14 @@ class Named:
 
 @dataclass(slots=True)
 class MatchJournal:
-    """Keeps the wanted matches of a run; a few references each, told only when they are written.
+    """Keeps the selected matches of a run as a few references each; they are evaluated only when written.
 
     Attributes:
-        choice: what is wanted. kept: by number, with seconds since the log's first event. matches: how many there were.
-        failed: how many of them were no result; those beyond :data:`MOST_FAILED` are not kept.
+        choice: the selection. kept: by number, with seconds since the log's first event. matches: their total number.
+        failed: matches without a result; those beyond :data:`MOST_FAILED` are not kept.
         removed: files of an earlier run.
-        rows: the ledger's row of each that is kept and gave a pose; light alone gives poses too, so not the number.
+        rows: row of each kept match in the trajectories, if it gave a pose. Light alone gives poses too, so the row is
+            not the match number.
     """
 
     choice: Choice
@@ -133,7 +135,7 @@ class MatchJournal:
     _before: float = -math.inf
 
     def attach(self, state: State) -> None:
-        """Have the estimator tell every match from now on."""
+        """Installs the trace of every match in the estimator."""
 
         def told(scan: Scan, points: ScanPoints, asked: Asked | None, result: MatchResult) -> None:
             if self.wants(scan.t_end, result):
@@ -143,17 +145,17 @@ class MatchJournal:
         state.journal = told
 
     def begins(self, t_mono: float) -> None:
-        """The log's first event was at this instant."""
+        """Sets the instant of the log's first event, s."""
         self._t_first = t_mono
 
     def gave(self, row: int | None) -> None:
-        """The cycle has ended, and its pose has this row of the ledger; None: it gave no pose."""
+        """Notes the end of a cycle and the row of its pose in the trajectories; None: it gave no pose."""
         if self.matches > self._told and self.matches in self.kept and row is not None:
             self.rows[self.matches] = row
         self._told = self.matches
 
     def wants(self, t_mono: float, result: MatchResult) -> bool:
-        """Count a match, and say whether it is to be kept."""
+        """Counts a match; True if it is selected."""
         self.matches += 1
         at, before = t_mono - self._t_first, self._before
         self._before = at
@@ -164,9 +166,9 @@ class MatchJournal:
         return wanted or timed or self.matches in self.choice.numbers
 
     def named(self, stamps: Array) -> list[Named]:
-        """Those that are kept, by number, with what they are called in ``trajectory.tum``.
+        """Returns the kept matches by number, with their identification in ``trajectory.tum``.
 
-        ``stamps``: of the poses, in the order in which they came; the file has them in ascending order.
+        ``stamps``: of the poses in order of arrival, s; the file has them in ascending order.
         """
         line = np.empty(len(stamps), np.int64)
         line[np.argsort(stamps, kind="stable")] = 1 + np.arange(len(stamps))
@@ -178,7 +180,7 @@ class MatchJournal:
         return found
 
     def files(self, stamps: Array) -> Iterator[tuple[str, bytes]]:
-        """``match-N.json`` and, with matplotlib, ``match-N.png`` of each, one at a time; ``stamps`` as for `named`."""
+        """Yields ``match-N.json`` and, with matplotlib, ``match-N.png`` of each; ``stamps`` as for `named`."""
         for name in self.named(stamps):
             number, entry = name.match, self.kept[name.match][1]
             told = match_trace.tell(entry.asked)
@@ -188,10 +190,10 @@ class MatchJournal:
                 yield f"match-{number}.png", picture
 
     def clear(self, folder: Path) -> None:
-        """Remove the matches that an earlier run has left in ``folder``; nothing else is touched.
+        """Removes the matches of an earlier run from ``folder``, and no other file.
 
         Raises:
-            OutputRefused: one of them may not be removed.
+            OutputRefused: one of them cannot be removed.
         """
         for path in sorted(folder.iterdir()):
             if not (OURS.fullmatch(path.name) and path.is_file()):
@@ -203,11 +205,11 @@ class MatchJournal:
             self.removed += 1
 
     def missed(self) -> bool:
-        """Whether matches were asked for by number or time and none at all was found."""
+        """True if matches were requested by number or time and none was found."""
         return not self.kept and bool(self.choice.numbers or self.choice.seconds)
 
     def sentences(self) -> list[str]:
-        """What a person should know of what was written and what was not."""
+        """Returns sentences for the operator on what was written and what was not."""
         said = [f"matches written: {len(self.kept)}" + self._cleared()]
         missing = sorted(n for n in self.choice.numbers if n > self.matches)
         if missing:
@@ -229,7 +231,7 @@ class MatchJournal:
 
 
 def document(name: Named, entry: Entry, told: tuple[Told, ...]) -> dict[str, Any]:
-    """Everything about one match, ready for JSON."""
+    """Returns all data of one match, ready for JSON."""
     scan, result = entry.scan, entry.result
     return {
         "format": FORMAT,
@@ -260,7 +262,7 @@ def document(name: Named, entry: Entry, told: tuple[Told, ...]) -> dict[str, Any
 
 
 def _refusal(entry: Entry, told: tuple[Told, ...]) -> dict[str, Any] | None:
-    """What the place that was rejected showed, and what was asked of it; None for other outcomes."""
+    """Returns evidence and thresholds of a rejected match; None for other outcomes."""
     judged = [one.attempt for one in told if one.attempt.demand is not None]
     if entry.asked is None or entry.result.reason is not Reason.REJECTED or not judged:
         return None
@@ -347,6 +349,6 @@ def _light(said: LightSaid) -> dict[str, Any]:
 
 
 def _rounded(values: Array) -> list[Any]:
-    """Micrometres, microradians: what is computed from further is in full."""
+    """Rounds to micrometres and microradians; the inputs of further computation stay in full."""
     rounded: list[Any] = np.round(values, 6).tolist()
     return rounded

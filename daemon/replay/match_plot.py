@@ -1,4 +1,4 @@
-"""A match as a picture: the scan on the local map before and after, pairs by residual, light points, convergence."""
+"""Plot of one scan match: scan on the local map before and after, pairs by residual, lamps, convergence."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _MARGIN_M: Final = 0.5
 
 
 def available() -> bool:
-    """Whether pictures can be drawn here (matplotlib is an extra)."""
+    """True if matplotlib, an extra, is installed."""
     return find_spec("matplotlib") is not None
 
 
 def draw(name: str, entry: Entry, told: tuple[Told, ...]) -> bytes | None:
-    """PNG of one match, called ``name``; None without matplotlib."""
+    """Returns a PNG of one match with the title ``name``; None without matplotlib."""
     if not available():
         return None
     from matplotlib.figure import Figure
@@ -57,7 +57,7 @@ def _title(name: str, entry: Entry, told: tuple[Told, ...]) -> str:
 
 
 def _chosen(entry: Entry, told: tuple[Told, ...]) -> Told:
-    """The attempt that the result is of: the one with as many inliers and as long a correction."""
+    """Returns the attempt that gave the result: the last one with the same number of inliers."""
     same = [one for one in told if one.what != "trial" and int(one.attempt.sums[icp.INLIERS]) == entry.result.inliers]
     return same[-1] if same else told[0]
 
@@ -70,13 +70,13 @@ def _plain(axes: Any, entry: Entry) -> None:
 
 
 def _most(told: Told) -> float:
-    """End of the colour scale in mm: nearly all residuals of the first iteration lie within."""
+    """Returns the end of the colour scale, mm: 95 % of the residuals of the first iteration lie within."""
     values = told.iterations[0].pairs.residual_m if told.iterations else np.empty(0)
     return max(1.0, 1e3 * float(np.quantile(np.abs(values), 0.95))) if len(values) else 1.0
 
 
 def _pairs(axes: Any, what: tuple[Entry, Told], number: int, most: float) -> Any:
-    """The scan at one iteration on the map: every pair a line and its point, coloured by the residual."""
+    """Plots the scan at one iteration on the map: each pair as a line and its point, coloured by the residual."""
     entry, told = what
     assert entry.asked is not None
     elements = entry.asked[1].elements
@@ -112,7 +112,7 @@ def _coloured(axes: Any, one: Iteration, ends: tuple[Array, Array], most: float)
 
 
 def _lights(axes: Any, entry: Entry, said: LightSaid) -> None:
-    """Lamps where light sees them from here, by the matched pose, and where it saw them from the newest keyframe."""
+    """Plots the lamp positions by light at the matched pose, and those from the newest keyframe."""
     for k, lamp in enumerate(said.lamps):
         now = se2.apply(entry.result.T_odom_base, lamp.present[None])[0]
         axes.plot(*now, "*", color="gold", markeredgecolor="k", markersize=12, label=None if k else "lamp, from here")
@@ -127,7 +127,7 @@ def _lights(axes: Any, entry: Entry, said: LightSaid) -> None:
 
 
 def _residuals(axes: Any, both: tuple[Told, Told]) -> None:
-    """Residuals of the first and of the last iteration."""
+    """Plots the residuals of the first and of the last iteration."""
     first, last = both
     for told, number, name in ((first, 0, "first iteration"), (last, -1, "last iteration")):
         if told.iterations:
@@ -138,7 +138,7 @@ def _residuals(axes: Any, both: tuple[Told, Told]) -> None:
 
 
 def _convergence(axes: Any, told: tuple[Told, ...]) -> None:
-    """How far each iteration began from where its attempt ended, and its robust scale."""
+    """Plots the distance of each iteration's start from the end of its attempt, and its robust scale."""
     for one in told:
         away = [se2.between(one.attempt.T, step.T_odom_base) for step in one.iterations]
         far = [1e3 * max(float(np.hypot(x, y)), 1e-6) for x, y, _ in away]

@@ -1,4 +1,4 @@
-"""Configuration, lights and map of a replay: a person's where given, else those of the recorded run."""
+"""Configuration, lights and initial map of a replay: the operator's where given, else those of the recorded run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hal.errors import DataInvalid
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What of the configuration a person has asked for: a whole ``file``, and single ``keys`` (dotted paths)."""
+    """Part of the configuration that the operator has set: a whole ``file``, and single ``keys`` (dotted paths)."""
 
     file: bool = False
     keys: tuple[str, ...] = ()
@@ -32,7 +32,10 @@ NOTHING_GIVEN: Final = Given()
 
 
 def config_for(source: Source, config: Config, given: Given) -> Config:
-    """The configuration that counts: a person's, else the recording's, with the log's mount where none was given."""
+    """Returns the effective configuration: the operator's, else the recording's.
+
+    If no lidar mount was given, the mount in the log is used.
+    """
     if source.recorded and not given.file:
         tree = brought_up(dict(source.header.get("config", {})))
         try:
@@ -48,12 +51,12 @@ def config_for(source: Source, config: Config, given: Given) -> Config:
 
 
 def lights_for(source: Source, used: Config, given: Given) -> Lights | None:
-    """What the estimator is told of lights: as recorded, unless a person has asked for another survey or none.
+    """Returns the light setup as recorded, unless the operator has set another survey or none.
 
-    The recorded sample clock counts in any case, except for another air interface than the recorded one.
+    The recorded sample clock is used in any case, except for another air interface than the recorded one.
 
     Raises:
-        DataInvalid: what was recorded, or the survey asked for, cannot be used.
+        DataInvalid: the recorded light setup or the requested survey cannot be used.
     """
     if not (source.recorded and used.photodiode.fitted):
         return None
@@ -65,10 +68,12 @@ def lights_for(source: Source, used: Config, given: Given) -> Lights | None:
 
 
 def start_for(source: Source, used: Config, lights: Lights | None, given: Given) -> Start | None:
-    """The map that the run began with; that of ``map.folder`` only where a person has asked for it. None: with none.
+    """Returns the initial map of the run; None: without a map.
+
+    A map of ``map.folder`` is used only if the operator has requested it.
 
     Raises:
-        DataInvalid: the map asked for, or recorded, cannot be used.
+        DataInvalid: the requested or recorded map cannot be used.
     """
     if source.begin is not None:
         return None
@@ -102,7 +107,7 @@ def _recorded_lights(source: Source) -> Lights | None:
 
 
 def _recorded_clock(source: Source, used: Config) -> float | None:
-    """The sample clock that the recorded run was told, in ppm; None where it cannot be that of this run."""
+    """Returns the sample clock error of the recorded run, ppm; None if it cannot apply to this run."""
     try:
         recorded = from_header(source.header)
     except ValueError:
@@ -112,7 +117,7 @@ def _recorded_clock(source: Source, used: Config) -> float | None:
 
 
 def _laid_over(tree: dict[str, Any], config: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
-    """``tree`` with the values that ``config`` has for ``keys`` (dotted paths)."""
+    """Returns ``tree`` with the values that ``config`` has for ``keys`` (dotted paths)."""
     for key in keys:
         branch, chosen = tree, config
         *parents, last = key.split(".")

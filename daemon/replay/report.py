@@ -1,4 +1,4 @@
-"""Results of a replay: trajectories, loops, map, and a summary that is the same each time; timing stands apart."""
+"""Result files of a replay: trajectories, loops, map and a reproducible summary; timing is in a file of its own."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from estimator import Grid, Identity
 from estimator.paper import LUMILOOP
 
 LONGEST_NAME: Final = 64
-"""Of a map."""
+"""Longest name of a map, characters."""
 LOOPS_HEAD: Final = "stamp,counter,keyframe_new,keyframe_old,residual_m\n"
 
 
 def write_all(folder: Folder, outcome: Outcome) -> None:
-    """Every result that there is room for; each file is written whole or not at all."""
+    """Writes every result that there is room for; each file appears whole or not at all."""
     begun = time.perf_counter()
     ledger = outcome.rerun.ledger
     final, grid = ledger.final(), outcome.rerun.render()
@@ -49,7 +49,7 @@ def write_all(folder: Folder, outcome: Outcome) -> None:
 
 
 def _map(outcome: Outcome) -> bytes:
-    """The map as ``lumiloop run`` keeps it, the same each time."""
+    """Returns the map file as ``lumiloop run`` stores it; reproducible."""
     map_id = zlib.crc32(outcome.source.path.name.encode()) | 1
     image = outcome.rerun.image(Identity(map_id, outcome.source.path.name[:LONGEST_NAME], session=1))
     return packed(image, meta_of(image, 0.0, outcome.config.name, release()))
@@ -68,7 +68,7 @@ def _json(content: dict[str, Any]) -> bytes:
 
 
 def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
-    """Everything about a replay that is the same each time."""
+    """Returns the reproducible part of a replay's results."""
     source, rerun, ledger = outcome.source, outcome.rerun, outcome.rerun.ledger
     step_m, step_rad, step_at = ledger.largest_step()
     driven_m, turned_rad = ledger.way()
@@ -120,14 +120,14 @@ def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
 
 
 def _matches(outcome: Outcome) -> list[dict[str, Any]] | None:
-    """The matches that are written; None where none were asked for."""
+    """Returns the written matches; None if none were requested."""
     if outcome.journal is None:
         return None
     return [asdict(name) for name in outcome.journal.named(outcome.rerun.ledger.online().stamps)]
 
 
 def _recorded(outcome: Outcome) -> dict[str, Any] | None:
-    """How a recording's replay compares with what was recorded; None for other logs and other methods."""
+    """Returns the comparison with the recorded run; None for other logs and other methods."""
     compared = outcome.rerun.comparison
     if not outcome.source.recorded or outcome.rerun.method != LUMILOOP:
         return None
@@ -141,7 +141,7 @@ def _recorded(outcome: Outcome) -> dict[str, Any] | None:
 
 
 def timing(outcome: Outcome) -> dict[str, Any]:
-    """What was measured with a watch."""
+    """Returns the measured durations."""
     rerun, run_s = outcome.rerun, outcome.seconds["run"]
     cycles = sorted(rerun.timing.cycles) or [0.0]
     log_s = rerun.t_mono - rerun.t_first if rerun.timing.cycles else 0.0

@@ -1,6 +1,6 @@
-"""Results as files that other tools read: trajectories (TUM), grid maps (map_server), a picture.
+"""Output formats of results for other tools: trajectories as TUM and KITTI text, and a folder of whole files.
 
-Each file appears whole or not at all: it is written beside its place and moved there.
+Each file appears whole or not at all: it is written beside its final path and then moved there.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ _TUM_HEAD: Final = "# timestamp x y z qx qy qz qw\n"
 
 
 class OutputRefused(Exception):
-    """A result cannot be written; the text names the file or folder, why, and what to do."""
+    """A result cannot be written; the text names the file or folder, the cause and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Stamps in seconds (n,), poses (x, y, yaw) (n, 3), and the states in which they were published (n,), None: any."""
+    """Stamps (n,) in s, poses (n, 3) as (x, y, yaw) in m, m, rad, and published states (n,); None: any."""
 
     stamps: Array
     poses: Array
     states: npt.NDArray[np.int64] | None = None
 
     def ordered(self) -> Trajectory:
-        """The same, ascending by stamp, equal stamps in their given order."""
+        """Returns the trajectory in ascending order of stamps, equal stamps in their given order."""
         order = np.argsort(self.stamps, kind="stable")
         return Trajectory(self.stamps[order], self.poses[order], None if self.states is None else self.states[order])
 
     def guesses(self) -> list[str]:
-        """For every pose the state in which it is a guess; empty: it is none."""
+        """Returns for every pose the state in which it is unconfirmed; empty for a confirmed one."""
         if self.states is None:
             return [""] * len(self.stamps)
         return [State(state).name if state in GUESSED else "" for state in self.states.tolist()]
 
 
 class Folder:
-    """Where results go; made and tried before any work is done for them."""
+    """Output folder, made and tested before any work is done."""
 
     def __init__(self, path: Path) -> None:
-        """Make the folder if it is not there.
+        """Makes the folder if it does not exist.
 
         Raises:
             OutputRefused: it is a file, may not be written, or has no room.
@@ -71,14 +71,14 @@ class Folder:
             ) from error
 
     def demand(self, name: str) -> None:
-        """Try whether a file of that name could be put in place; what is there stays.
+        """Checks that a file of that name could be written; an existing file stays.
 
         Raises:
-            OutputRefused: it is a folder, the name is too long, or may not be looked at.
+            OutputRefused: it is a folder, the name is too long, or it may not be accessed.
         """
         final, beside = self._places(name)
         try:
-            taken = final.is_dir()  # which tells of some errors by raising them
+            taken = final.is_dir()  # raises for some errors
             beside.touch()
             beside.unlink()
         except OSError as error:
@@ -87,10 +87,10 @@ class Folder:
             raise OutputRefused(f"{final} is a folder; name a file in it")
 
     def write(self, name: str, data: bytes) -> None:
-        """Put one file in place.
+        """Writes one file.
 
         Raises:
-            OutputRefused: no room, no permission; what was there before stays.
+            OutputRefused: no room, or no permission; an existing file stays.
         """
         final, beside = self._places(name)
         try:
@@ -102,14 +102,14 @@ class Folder:
             raise OutputRefused(f"cannot write {final}: {error.strerror}; free space or name another folder") from error
 
     def _places(self, name: str) -> tuple[Path, Path]:
-        """Where a file goes, and where it is written first."""
+        """Returns the final path of a file, and the path that it is first written to."""
         return self.path / name, self.path / f".{name}.part"
 
     def write_each(self, files: Iterable[tuple[str, bytes]]) -> None:
-        """Put files in place by name; one that cannot be written keeps none of the others away.
+        """Writes files by name; a file that cannot be written does not prevent the others.
 
         Raises:
-            OutputRefused: for the first that was refused, after all were tried; names the others.
+            OutputRefused: for the first failed file, after all were tried; names the others.
         """
         refused: list[tuple[str, OutputRefused]] = []
         for name, data in files:
@@ -124,9 +124,10 @@ class Folder:
 
 
 def tum(trajectory: Trajectory) -> bytes:
-    """TUM text: ``t x y z qx qy qz qw``, one pose a line, ascending by stamp (equal stamps in their given order).
+    """Returns TUM text: ``t x y z qx qy qz qw``, one pose a line, ascending by stamp.
 
-    A guess is a remark, ``# STATE t x y ...``: who reads the file compares what was said to be known.
+    Equal stamps stay in their given order. An unconfirmed pose is a comment, ``# STATE t x y ...``, so that an
+    evaluation uses confirmed poses only.
     """
     told = trajectory.ordered()
     half = 0.5 * told.poses[:, 2]
@@ -140,7 +141,7 @@ def tum(trajectory: Trajectory) -> bytes:
 
 
 def guessed(told: Trajectory) -> str:
-    """How many of the poses say where the robot may be, not where it is, as a sentence; empty: none does."""
+    """Returns a sentence with the number of unconfirmed poses; empty if there are none."""
     guesses = told.guesses()
     states = Counter(filter(None, guesses))
     if not states:
@@ -151,9 +152,9 @@ def guessed(told: Trajectory) -> str:
 
 
 def kitti(trajectory: Trajectory) -> bytes:
-    """KITTI text: the upper three rows of each pose's matrix in one line, ascending by stamp; it has no stamps.
+    """Returns KITTI text: the upper three rows of each pose's matrix in one line, ascending by stamp, without stamps.
 
-    It has no remarks either: guesses are left out.
+    The format has no comments either, so unconfirmed poses are omitted.
     """
     told = trajectory.ordered()
     poses = told.poses[[not guess for guess in told.guesses()]]

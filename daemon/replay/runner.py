@@ -1,4 +1,4 @@
-"""Drives the daemon's own cycle with a log's events on a virtual clock, as fast as it can, and keeps what comes out."""
+"""Replay runner: feeds a log's events to the daemon's own cycle on a virtual clock and collects the results."""
 
 from __future__ import annotations
 
@@ -41,47 +41,47 @@ from hal.imu import RawImu
 from hal.lidar import Link, RawScan
 from hal.odometry import RawOdometry
 
-if TYPE_CHECKING:  # loaded only where somebody asks for matches
+if TYPE_CHECKING:  # loaded only if matches are requested
     from daemon.replay.match_journal import MatchJournal
     from estimator import State
 
 
 class ReplayClock:
-    """A clock that stands where the replay puts it (`hal.clock.Clock`)."""
+    """Clock that the replay sets (`hal.clock.Clock`)."""
 
     def __init__(self) -> None:
         self.t_mono = 0.0
 
     def now(self) -> float:
-        """Seconds of the log's monotone time."""
+        """Returns the log's monotonic time, s."""
         return self.t_mono
 
     def utc(self) -> float:
-        """The same: a replay has no calendar."""
+        """Returns the same: a replay has no calendar."""
         return self.t_mono
 
 
 class ReplayBudget(FixedBudget):
-    """No caps for a log of others; for a recording the caps of the cycle that is being repeated."""
+    """No caps for a third-party log; for a recording, the caps of the repeated cycle."""
 
     def __init__(self) -> None:
         super().__init__()
         self.now = UNLIMITED
 
     def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
-        """The caps in force."""
+        """Returns the caps in force."""
         return self.now
 
 
 @dataclass(slots=True)
 class Comparison:
-    """What a recording says that was published, against its replay.
+    """Comparison of a replay with what its recording published.
 
     Attributes:
-        cycles: that were recorded. differ: whose pose, state, reason or inputs are not the same to the last bit, or
-            which cannot be run again. first: says how the first did.
-        judged: those of which state and reason were compared; of older recordings none.
-        faults: by number, in how many of those it was published. Not compared: a replay has no devices.
+        cycles: recorded cycles. differ: cycles whose pose, state, reason or input differ in any bit, or that cannot run
+            again. first: description of the first of them.
+        judged: cycles of which state and reason were compared; none in older recordings.
+        faults: number of these cycles that published each fault. Not compared: a replay has no devices.
     """
 
     cycles: int = 0
@@ -91,21 +91,21 @@ class Comparison:
     faults: Counter[int] = field(default_factory=Counter)
 
     def note(self, cycle: int, how: str) -> None:
-        """Count one cycle that is not the recorded one."""
+        """Counts a cycle that differs from the recorded one."""
         self.differ += 1
         self.first = self.first or f"cycle {cycle}: {how}"
 
 
 @dataclass(slots=True)
 class Timing:
-    """Measured seconds; the only thing about a replay that is not repeatable."""
+    """Measured durations, s; the only part of a replay that is not repeatable."""
 
     cycles: array[float] = field(default_factory=lambda: array("d"))
     steps: array[float] = field(default_factory=lambda: array("d"))
 
 
 class Rerun:
-    """One log through one fresh daemon cycle: feed it every event, then ask for the results."""
+    """Replays one log through a new daemon cycle: feed every event, then read the results."""
 
     def __init__(
         self,
@@ -116,13 +116,13 @@ class Rerun:
         start: Start | None = None,
         name: str = LUMILOOP,
     ) -> None:
-        """A run of the method called ``name``.
+        """Prepares a run of the method called ``name``.
 
-        ``start``: the map that it begins with; where the log begins with a state, that counts. Another method than the
-        daemon's begins with neither, has no caps and is not compared with what was recorded.
+        ``start``: initial map; if the log begins with a checkpoint, the checkpoint is used. Another method than the
+        daemon's begins with neither, has no caps and is not compared with the recording.
 
         Raises:
-            DataInvalid: that state cannot be used.
+            DataInvalid: the checkpoint cannot be used.
         """
         self.method, own = name, name == LUMILOOP
         begin = source.begin.load() if own and source.begin is not None else None
@@ -183,32 +183,32 @@ class Rerun:
 
     @property
     def _repeats(self) -> bool:
-        """Whether the run repeats a recorded one to the last bit."""
+        """True if the run repeats a recorded one to the last bit."""
         return self._source.recorded and self.method == LUMILOOP
 
     @property
     def state(self) -> State:
-        """The estimator's, to be looked at."""
+        """Estimator state, for reading."""
         return self._state
 
     @property
     def t_mono(self) -> float:
-        """Where the log's clock stands."""
+        """Present time of the log's clock, s."""
         return self._clock.t_mono
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """Those that are present, gravest first; to be asked for once a second.
+        """Present faults, gravest first; to be read once a second.
 
-        What the data say (:data:`~daemon.health.assessment.REPLAYED`) is said anew; all others are those that were
-        published.
+        Faults that follow from the data (:data:`~daemon.health.assessment.REPLAYED`) are derived again. All others are
+        those that were published.
         """
         now = vitals(self.cycle.facts(), set(), 0.0)
         again = [fault for fault in assess(now, now) if fault in REPLAYED]
         return tuple(sorted([*again, *(fault for fault in Fault if fault in self._published - REPLAYED)]))
 
     def feed(self, event: Event) -> None:
-        """Take one event; runs a cycle where one is due."""
+        """Consumes one event and runs a cycle if one is due."""
         if isinstance(event, Turn):
             self._repeat(event)
             return
@@ -229,19 +229,22 @@ class Rerun:
             self.cycle.inbox.put_imu(event)
 
     def finish(self) -> None:
-        """The log has ended: poses take the places their anchors have now."""
+        """Ends the log: poses move with their keyframes to the final positions."""
         self.ledger.settle(estimator.keyframe_poses(self._state))
 
     def render(self) -> Grid:
-        """The map at the finest resolution that its extent allows."""
+        """Returns the grid map at the finest resolution that its extent allows."""
         return finest(partial(estimator.render_map, self._state))
 
     def image(self, identity: Identity) -> MapImage:
-        """The map as it is kept on a disk."""
+        """Returns the map as it is stored on a disk."""
         return image_of(self._state, identity)
 
     def lamps(self) -> Array | None:
-        """(k, 2) surveyed places of the lamps in the map frame; None until light has told where the map lies."""
+        """Returns (k, 2) surveyed lamp positions in the map frame, m.
+
+        None until light has aligned the map to the survey.
+        """
         result = self.cycle.result
         if result is None or self._lights is None or not result.placed:
             return None
@@ -259,7 +262,7 @@ class Rerun:
         self.readings += 1
 
     def _repeat(self, turn: Turn) -> None:
-        """Run a recorded cycle: at its time, with its commands, caps and answers; then compare."""
+        """Runs a recorded cycle at its time with its commands, caps and job results, then compares it."""
         entry = turn.entry
         self._clock.t_mono = turn.t_mono
         self.t_first = min(self.t_first, turn.t_mono)
@@ -282,10 +285,10 @@ class Rerun:
                 self._compare(entry, record)
 
     def _switch(self, sha256: str) -> tuple[int, str]:
-        """Go on in the map that the recorded run went on in.
+        """Switches to the map that the recorded run switched to; returns map ID and digest.
 
         Raises:
-            LookupError: it is not with the recording, or not the one.
+            LookupError: the map is not with the recording, or has another digest.
         """
         path = self._source.files[0].parent / switch_name(sha256)
         try:

@@ -1,7 +1,7 @@
-"""Logs of every kind as one stream of events, in the order in which the daemon would have seen them.
+"""Log sources: CARMEN logs, SCIP captures and recordings as one stream of events, in order of arrival.
 
-A log's scans, odometry and gyro readings carry the time of their arrival in the virtual clock. A recording of our own
-also says where each cycle ran (`CycleEntry`); in every other log a cycle runs when a scan has arrived.
+Scans, odometry and gyro readings of a log carry their arrival time in the virtual clock. Our own recordings also
+contain where each cycle ran (`CycleEntry`). In every other log a cycle runs when a scan has arrived.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ Mount = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """A recorded cycle: it began at ``t_mono`` and did what ``entry`` says."""
+    """A recorded cycle that began at ``t_mono``, s; ``entry``: its input and decisions."""
 
     t_mono: float
     entry: CycleEntry
@@ -59,17 +59,17 @@ Event = RawScan | RawSamples | RawOdometry | RawImu | Turn
 
 
 class Source(ABC):
-    """A log, ready to be played once.
+    """A log, ready to be replayed once.
 
     Attributes:
-        kind: of log, for people. recorded: whether it says where cycles ran.
+        kind: of log, for the operator. recorded: whether it contains where cycles ran.
         path: as the user named it. files: in order.
-        report: what was skipped or assumed, complete at the end. status: the driver's counters, live.
+        report: what was skipped or assumed, complete at the end. status: counters of the driver, live.
         total: units of progress in the whole log; done: so far.
-        mount: (x, y, yaw) of the lidar as the log knows it, m and rad, or None.
-        header: of a recording: versions and configuration it was made with.
-        begin: the moment that it begins at, None where that is the start of a run.
-        t_begun: start of the run in its own time, 0: not known.
+        mount: (x, y, yaw) of the lidar in the log, m, m, rad; or None.
+        header: of a recording: its versions and configuration.
+        begin: checkpoint that it begins with; None at the start of a run.
+        t_begun: start of the run in its own time, s; 0: not known.
     """
 
     kind: ClassVar[str]
@@ -88,19 +88,19 @@ class Source(ABC):
 
     @abstractmethod
     def events(self) -> Iterator[Event]:
-        """Everything in order."""
+        """Yields all events in order."""
 
     def utc(self, t_mono: float) -> float:
-        """The log's own stamp for an instant of the virtual clock, where it has one that goes on without scans."""
+        """Returns the log's own stamp, s, for an instant of the virtual clock, if it has one without scans."""
         return t_mono
 
     @abstractmethod
     def stamp(self, scan: RawScan) -> float:
-        """The log's own stamp, seconds, of a scan it has delivered."""
+        """Returns the log's own stamp of a scan that it has delivered, s."""
 
 
 def open_log(path: Path) -> Source:
-    """Find out what kind of log this is and read as much of it as is needed to play it.
+    """Detects the kind of a log and reads as much of it as its replay needs.
 
     Raises:
         HalError: missing, unreadable, or of no known kind; names the file and the remedy.
@@ -129,12 +129,17 @@ FOREIGN: Final = {
     b"BZh": "a bzip2 archive",
 }
 MOVED_S: Final = 0.005
-"""The passive codec does not know the speed of the line, nor what the driver knew of the sensor's clock."""
+"""Tolerance between decoded and recorded scan times, s: the passive codec has neither the baud rate nor the driver's
+model of the sensor clock."""
 _REMEDY: Final = "unpack it, or turn it into a CARMEN log with `lumiloop convert IN OUT`"
 
 
 def sha256_of(source: Source) -> str:
-    """Digest of a log: of its file, or of a recording's segments one after the other; raises `HalError`."""
+    """Returns the digest of a log: of its file, or of a recording's segments one after the other.
+
+    Raises:
+        HalError: a file cannot be read.
+    """
     digest = hashlib.sha256()
     for file in source.files:
         try:
@@ -152,13 +157,13 @@ class CarmenSource(Source):
     kind = "CARMEN log"
 
     def __init__(self, path: Path) -> None:
-        """Read it; raises `HalError`."""
+        """Reads the log; raises `HalError`."""
         self._log: CarmenLog = read_carmen(path)
         super().__init__(path, self._log.report, LidarStatus(dialect=self.kind), len(self._log.stamps))
         self.mount = self._log.mount
 
     def events(self) -> Iterator[Event]:
-        """Scans in file order, with the odometry due before each."""
+        """Yields scans in file order, with the odometry due before each."""
         for event in self._log.events(LEAD_S):
             if isinstance(event, RawScan):
                 self.done += 1
@@ -166,17 +171,17 @@ class CarmenSource(Source):
             yield event
 
     def stamp(self, scan: RawScan) -> float:
-        """The stamp as the log has it, whatever was done to make time monotone."""
+        """Returns the stamp as in the log, s, without the changes that make time monotonic."""
         return float(self._log.stamps[scan.seq])
 
 
 class CaptureSource(Source):
-    """What a SCIP sensor said, byte for byte; see `hal.replay.capture`."""
+    """Bytes from a SCIP sensor; see `hal.replay.capture`."""
 
     kind = "SCIP capture"
 
     def __init__(self, path: Path) -> None:
-        """Read it; raises `HalError`."""
+        """Reads the capture; raises `HalError`."""
         report = LogReport()
         self._chunks: list[Chunk] = read_capture(path, report)
         self._codec = PassiveHokuyo(device=str(path))
@@ -184,7 +189,7 @@ class CaptureSource(Source):
         self._origin = 1e-6 * self._chunks[0].t_us
 
     def events(self) -> Iterator[Event]:
-        """Scans as their last byte arrives."""
+        """Yields scans as their last byte arrives."""
         latest = 0.0
         for chunk in self._chunks:
             self.done += 1
@@ -196,13 +201,13 @@ class CaptureSource(Source):
             )
 
     def stamp(self, scan: RawScan) -> float:
-        """Time of the capturing host."""
+        """Returns the time of the capturing host, s."""
         return scan.t_mono - LEAD_S + self._origin
 
 
 @dataclass(slots=True)
 class _Marks:
-    """Scans that were decoded and not yet claimed by a mark, and what did not fit together."""
+    """Decoded scans that no mark has claimed yet, and the counts of mismatches."""
 
     decoded: list[RawScan] = field(default_factory=list)
     moved: int = 0
@@ -211,7 +216,7 @@ class _Marks:
 
 
 def _size(file: Path) -> int:
-    """Bytes of a file, which the keeper of a ring that is being written may just have taken away; raises `HalError`."""
+    """Returns the size of a file, bytes; raises `HalError`, as a running ring may just have removed it."""
     try:
         return file.stat().st_size
     except OSError as error:
@@ -219,7 +224,7 @@ def _size(file: Path) -> int:
 
 
 def _number(header: dict[str, Any], key: str) -> float:
-    """An entry of a header, 0 where it holds none that is a number."""
+    """Returns an entry of a header; 0 if it is no finite number."""
     value = header.get(key, 0.0)
     return float(value) if isinstance(value, float | int) and math.isfinite(value) else 0.0
 
@@ -231,7 +236,11 @@ class RecordingSource(Source):
     recorded = True
 
     def __init__(self, path: Path, until: float = -math.inf) -> None:
-        """Open it, at its beginning or at the last state before the instant ``until`` (t_mono); raises `HalError`."""
+        """Opens it at its beginning, or at the last checkpoint before the instant ``until`` (t_mono, s).
+
+        Raises:
+            HalError: it cannot be read.
+        """
         whole = open_recording(path)
         self._recording: Recording = beginning(whole, until)
         self._codec = PassiveHokuyo(device=str(path), untimed=self._recording.first > 0)
@@ -248,15 +257,15 @@ class RecordingSource(Source):
             self.report.notes.append(f"begins with segment {self._recording.first}: what is before has lost its state")
 
     def stamp(self, scan: RawScan) -> float:
-        """UTC as the recording computer knew it when the recording began, carried on by its monotonic clock."""
+        """Returns UTC, s: that of the recording computer at the start, extrapolated by its monotonic clock."""
         return self.utc(scan.t_mono)
 
     def utc(self, t_mono: float) -> float:
-        """UTC of an instant; see :meth:`stamp`."""
+        """Returns the UTC of an instant, s; see :meth:`stamp`."""
         return self._utc + t_mono
 
     def events(self) -> Iterator[Event]:
-        """Inputs and cycles in the order in which they happened."""
+        """Yields inputs and cycles in the order in which they happened."""
         if self.begin is not None:
             self._listen_in(self.begin)
         for frame in self._recording.frames(self.report):
@@ -271,7 +280,7 @@ class RecordingSource(Source):
         self._say()
 
     def _listen_in(self, moment: Moment) -> None:
-        """Let the codec hear what the line had said before."""
+        """Feeds the codec with the bytes of the lidar line before the checkpoint."""
         for frame in frames_in(moment.line):
             self._event(frame)
         self._marks = _Marks()
@@ -298,10 +307,10 @@ class RecordingSource(Source):
         return None
 
     def _claim(self, mark: ScanMark) -> RawScan | None:
-        """The decoded scan that the driver delivered then, under the driver's number and time.
+        """Returns the decoded scan that the driver delivered then, with the driver's number and time.
 
-        The passive codec sees the bytes alone. Scans that the driver passed over (it was still opening the sensor) stay
-        out, and where the two saw different histories of the sensor's clock, the driver's time counts.
+        The passive codec has the bytes alone. Scans that the driver skipped (it was still opening the sensor) are
+        omitted. Where both had different histories of the sensor clock, the driver's time is used.
         """
         marks = self._marks
         while marks.decoded and marks.decoded[0].t_rx < mark.t_rx:

@@ -1,4 +1,4 @@
-"""What a replay keeps of every scan: poses as published, poses as they stand at the end, and the figures of a run."""
+"""Trajectories of a replay: poses as published, poses as finally optimised, and the statistics of a run."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ _ONLINE, _ODOM, _ON_ANCHOR = slice(2, 5), slice(5, 8), slice(8, 11)
 
 @dataclass(slots=True)
 class Ledger:
-    """One row a scan, in the order of the log, and counts. A row is 96 bytes: a day at 40 Hz fits into memory.
+    """Table with one row per scan, in the order of the log, and counters.
 
-    Where scans are missing, there is a row for each cycle in which light alone held the pose.
+    A row has 96 bytes: a day at 40 Hz fits into memory. Where scans are missing, there is a row for each cycle in which
+    light alone held the pose.
 
     Attributes:
-        cycles, keyframes, matched: counts. outcomes: how often each reason of a match came. states: of the snapshot.
+        cycles, keyframes, matched: counts. outcomes: number of matches by reason. states: number of snapshots by state.
         loops: each with the stamp of its scan. corrected_m, corrected_rad: largest correction by a match.
-        jumps: of T_map_odom. dropped: scans that a later one replaced before a cycle took them.
+        jumps: of T_map_odom. dropped: scans that a later one replaced before a cycle consumed them.
     """
 
     cycles: int = 0
@@ -46,11 +47,11 @@ class Ledger:
     _settled: list[Array] = field(default_factory=list)
 
     def __len__(self) -> int:
-        """Rows: what gave a pose."""
+        """Number of rows: cycles that gave a pose."""
         return len(self._rows) // _FIELDS
 
     def add(self, record: CycleRecord, stamp: float, t_mono: float) -> None:
-        """Take in one cycle; ``stamp`` is the log's for the latest scan or block, which was true at ``t_mono``."""
+        """Adds one cycle; ``stamp``: the log's for the latest scan or block, s, whose time is ``t_mono``, s."""
         self.cycles += 1
         self.dropped += len(record.dropped)
         self.states[record.snapshot.state.name] += 1
@@ -79,9 +80,10 @@ class Ledger:
             self.corrected_rad = max(self.corrected_rad, abs(dyaw))
 
     def settle(self, keyframes: dict[int, Array]) -> None:
-        """Fix every pose by its anchor's present place: the map is about to be thrown away, or the log has ended.
+        """Fixes every pose by the present position of its anchor keyframe.
 
-        A pose whose anchor is not among ``keyframes`` stays as it was published.
+        Called before the map is discarded and at the end of the log. A pose whose anchor is not among ``keyframes``
+        stays as published.
         """
         rows = self._table()[sum(map(len, self._settled)) :]
         final = rows[:, _ONLINE].copy()
@@ -92,22 +94,22 @@ class Ledger:
         self._settled.append(final)
 
     def online(self) -> Trajectory:
-        """T_map_base of every scan as it was published, and in which state."""
+        """Returns T_map_base of every scan as published, with the published state."""
         rows = self._table()
         return Trajectory(rows[:, _STAMP], rows[:, _ONLINE], rows[:, _STATE].astype(np.int64))
 
     def final(self) -> Trajectory:
-        """T_map_base of every scan by what was known when it was settled; as published where it was not yet."""
+        """Returns T_map_base of every scan as fixed by :meth:`settle`; as published if not fixed yet."""
         rows = self._table()
         settled = np.concatenate([*self._settled, np.empty((0, 3))])
         return Trajectory(rows[:, _STAMP], np.concatenate([settled, rows[len(settled) :, _ONLINE]]))
 
     def odom(self) -> Array:
-        """T_odom_base of every scan, (n, 3)."""
+        """Returns T_odom_base of every scan, (n, 3), in m, m, rad."""
         return self._table()[:, _ODOM]
 
     def largest_step(self) -> tuple[float, float, float]:
-        """Largest step of T_odom_base between two scans: metres, radians, and the stamp after the one in metres."""
+        """Returns the largest step of T_odom_base between two scans, m and rad, and the stamp after the one in m."""
         poses = self.odom()
         if len(poses) < 2:
             return 0.0, 0.0, 0.0
@@ -116,7 +118,7 @@ class Ledger:
         return float(steps.max()), float(turns.max()), float(self._table()[int(steps.argmax()) + 1, _STAMP])
 
     def way(self) -> tuple[float, float]:
-        """Length of T_odom_base's path in metres, and all it has turned in radians."""
+        """Returns the path length of T_odom_base, m, and its total rotation, rad."""
         poses = self.odom()
         return (
             float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()),
@@ -128,5 +130,5 @@ class Ledger:
 
 
 def wrap(angles: Array) -> Array:
-    """Angles in rad, brought into -pi to pi."""
+    """Returns angles in rad, wrapped to -pi to pi."""
     return np.asarray(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)

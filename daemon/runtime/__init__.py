@@ -1,1 +1,1 @@
-"""The cycle and what drives it: inbox, budget, scheduler, worker, warm-up."""
+"""The cycle at run time: input, estimator step, caps, degradation, background worker, warm-up and monitoring."""

@@ -1,7 +1,8 @@
-"""Turns a cycle's time budget into caps, from measured times; nothing below the cycle reads a clock.
+"""Budget of a cycle: turns its computing time into caps for the estimator, from measured stage times.
 
-Order of degradation when time is short (`estimator.DegradationLevel`): first iterations are cut and the scan thinned,
-then map work waits, last the laser is left out where light or odometry can carry the pose. Neither is put off for good.
+Nothing below the cycle reads a clock. Degradation under lack of time (`estimator.DegradationLevel`) has a fixed order.
+First iterations are cut and the scan is thinned, then map work is deferred. Last the lidar is skipped where light or
+odometry can carry the pose. Neither map work nor the lidar is deferred without limit.
 """
 
 from __future__ import annotations
@@ -16,44 +17,47 @@ from daemon.runtime.degradation import Degradation
 from estimator import UNLIMITED, DegradationLevel, Limits, StepResult
 
 ENOUGH_ITERATIONS: Final = 12
-"""Iterations that a match hardly ever exceeds: more are cut first, for they are those of a second opinion; where these
-do not fit, the scan is thinned."""
+"""Iterations that a match hardly ever exceeds. Further ones belong to a multi-start and are cut first. If even these do
+not fit, the scan is thinned."""
 FEWEST_POINTS: Final = 120
 DENSE: Final = 400
 COARSE: Final = 4
-"""Scans of more points are matched on every fourth one at first: as in `scan_matcher.MatchSettings`, which is not
-imported, because the compiler comes with it (a test holds them equal)."""
+"""Scans with more than :data:`DENSE` points are first matched on every fourth point, as in
+`scan_matcher.MatchSettings`. That class is not imported, because the compiler comes with it; a test keeps both
+equal."""
 FIXED: Final = 6500
-"""What a match costs beside its iterations, in passes of one point through one iteration: cutting both saves only the
+"""Cost of a match beside its iterations, in passes of one point through one iteration: cutting both saves only the
 rest. Measured with Debian's Python on x86: 682 points in 5 iterations, most on every fourth point, take 82 us of the
-434 us of a match, 114 in 3 iterations 23 of 400: 53 and 67 ns a pass, 6600 and 5600 of them beside. Another interpreter
-or processor shifts that; what is then cut in vain, or too late, overruns tell."""
+434 us of a match; 114 points in 3 iterations take 23 of 400 us. That is 53 and 67 ns a pass, with 6600 and 5600 passes
+beside. Another interpreter or processor shifts these figures. Overruns then show what is cut in vain, or too late.
+"""
 LONGEST_MAP_WAIT: Final = 20
-"""Cycles in a row that may put off map work: a quarter of a metre, a keyframe, at 40 Hz and half a metre a second."""
+"""Consecutive cycles that may defer map work: a quarter of a metre, one keyframe, at 40 Hz and 0.5 m/s."""
 PROBE_EVERY: Final = 40
 PROBES: Final = 3
-"""Of so many cycles that pass the scan over, so many do not: they tell whether there is time again."""
+"""Of :data:`PROBE_EVERY` cycles that skip the lidar, this many use it; they show whether there is time again."""
 WORTH_IT: Final = 0.1
-"""Share of the budget that a level must save to be taken because of overruns: what other programs take is no reason."""
+"""Share of the budget that a level must save before overruns select it; load by other programs is no reason."""
 MEDIAN_OF: Final = 5
-"""Measurements whose median counts: one step during which another process ran says nothing about the cost."""
+"""Measurements in the median; a single step during which another process ran has no effect on the cost."""
 KNOWN_AFTER: Final = 3
-"""Measurements until something is said to be known: the first cycles are slow, for nothing is in the caches yet."""
+"""Measurements until a cost is valid: the first cycles are slow, because the caches are empty."""
 FORGETTING: Final = 0.1
 """Weight of a measurement when costs fall; a rise counts at once."""
 
 SEARCH_US: Final = 1000.0
 SEARCH_SHARE: Final = 0.1
-"""The search for further lamps gets so long, and no more than this share of the budget: it may take many cycles."""
+"""The search for further lamps gets :data:`SEARCH_US`, but at most this share of the budget; it may take many
+cycles."""
 FEWEST_CODES: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """What a cycle has cost.
+    """Measured cost of a cycle.
 
     Attributes:
-        us: microseconds by stage. budget_us: what it was allowed. light: a block of light samples was among it.
+        us: microseconds by stage. budget_us: its budget. light: the cycle had a block of light samples.
     """
 
     us: Mapping[str, float]
@@ -62,39 +66,39 @@ class Spent:
 
 
 class Budget(Protocol):
-    """Says before each step what it may do, and learns afterwards what it cost."""
+    """Gives the caps before each step, and learns the cost after it."""
 
     def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
-        """Caps for a step of a cycle that may take ``budget_us`` microseconds.
+        """Returns the caps for a step of a cycle that may take ``budget_us`` microseconds.
 
-        ``light``: a block of light samples is among it. ``carrier``: light or odometry can carry the pose.
+        ``light``: the step has a block of light samples. ``carrier``: light or odometry can carry the pose.
         """
         ...
 
     def learn(self, spent: Spent, limits: Limits, result: StepResult) -> None:
-        """Take in what the cycle under these caps has cost."""
+        """Updates the costs with the measured cost of a cycle under these caps."""
         ...
 
     def learn_code(self, code_us: float) -> None:
-        """Take in what the search for one light code costs, microseconds."""
+        """Sets the cost of the search for one light code, microseconds."""
         ...
 
 
 class FixedBudget:
-    """The same caps every time: replay of a foreign log, where time does not count."""
+    """The same caps for every step: for the replay of a third-party log, where time does not count."""
 
     def __init__(self, limits: Limits = UNLIMITED) -> None:
         self._limits = limits
 
     def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
-        """The caps given at construction."""
+        """Returns the caps given at construction."""
         return self._limits
 
     def learn(self, spent: Spent, limits: Limits, result: StepResult) -> None:
-        """Nothing to learn."""
+        """Does nothing."""
 
     def learn_code(self, code_us: float) -> None:
-        """Nothing to learn."""
+        """Does nothing."""
 
 
 class RecordedBudget:
@@ -104,10 +108,10 @@ class RecordedBudget:
         self._recorded: Iterator[Limits] = iter(recorded)
 
     def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
-        """The next cycle's caps.
+        """Returns the caps of the next cycle.
 
         Raises:
-            LookupError: more steps than were recorded.
+            LookupError: the replay makes more steps than were recorded.
         """
         limits = next(self._recorded, None)
         if limits is None:
@@ -115,17 +119,17 @@ class RecordedBudget:
         return limits
 
     def learn(self, spent: Spent, limits: Limits, result: StepResult) -> None:
-        """Nothing to learn."""
+        """Does nothing."""
 
     def learn_code(self, code_us: float) -> None:
-        """Nothing to learn."""
+        """Does nothing."""
 
 
 class MeasuredBudget:
-    """Real time: what a match, map work, light, and all the rest cost, tracked from cycle to cycle by stage.
+    """Budget in real time: tracks the cost of the match, map work, light and the rest from cycle to cycle.
 
-    What is left of the budget after light and the rest is for matching and the map. Cycles with light and those without
-    have a degradation each: in neither are scans thinned, or map work put off, for the sake of the other.
+    The budget minus light and the rest remains for matching and the map. Cycles with light and those without have
+    separate degradations. Neither kind thins its scans or defers map work because of the other.
     """
 
     def __init__(self) -> None:
@@ -137,7 +141,7 @@ class MeasuredBudget:
         self._plain, self._lit = Degradation(), Degradation()
 
     def limits(self, budget_us: float, light: bool = False, carrier: bool = False) -> Limits:
-        """Caps for a step of a cycle that may take ``budget_us``; none for matching until something was measured."""
+        """Returns the caps for a step within ``budget_us``; no caps for matching before the first measurement."""
         codes = self._codes(budget_us)
         if self._pass.us <= 0.0:
             return replace(UNLIMITED, codes=codes)
@@ -159,14 +163,14 @@ class MeasuredBudget:
         return self._lit if light else self._plain
 
     def _match_us(self, points: int) -> float:
-        """What a match of so many points, or all there are, costs."""
+        """Returns the cost of a match of so many points, or of all available ones, microseconds."""
         return self._pass.us * (FIXED + passes(ENOUGH_ITERATIONS, min(points, self._queries)))
 
     def _fits(self, left_us: float, budget_us: float) -> DegradationLevel:
-        """The best level that so many microseconds allow.
+        """Returns the best level that fits into ``left_us`` microseconds.
 
-        A match that does not fit is no reason to leave the laser out: overruns are (`Degradation`), or a cycle that
-        would take twice its budget, which is the whole period: scans would be lost.
+        A match that does not fit is no reason to skip the lidar. Overruns are (`Degradation`), and so is a cycle that
+        would take twice its budget. That is the whole scan period, so scans would be lost.
         """
         least_us = self._match_us(FEWEST_POINTS)
         if left_us >= self._match_us(self._queries) + self._map.us:
@@ -176,12 +180,12 @@ class MeasuredBudget:
         return DegradationLevel.NO_MAP if left_us + budget_us >= least_us else DegradationLevel.CARRIED
 
     def _pass_over(self) -> bool:
-        """Whether a scan is passed over: now and then a few are not, or it would never be known that there is time."""
+        """True if the scan is skipped. Some scans are used now and then, to detect that there is time again."""
         self._passed += 1
         return self._passed % PROBE_EVERY >= PROBES
 
     def _matching(self, left_us: float, with_map: bool) -> tuple[int, int]:
-        """Iterations and points that fit: first iterations beyond enough are cut, then the scan is thinned."""
+        """Returns iterations and points that fit: first cuts iterations beyond enough, then thins the scan."""
         if with_map:
             left_us -= self._map.us
         room = max(0.0, left_us / self._pass.us - FIXED)
@@ -199,11 +203,11 @@ class MeasuredBudget:
         return min(UNLIMITED.codes, max(FEWEST_CODES, affordable))
 
     def learn_code(self, code_us: float) -> None:
-        """Take in what the search for one light code costs."""
+        """Sets the cost of the search for one light code, microseconds."""
         self._code_us = code_us
 
     def learn(self, spent: Spent, limits: Limits, result: StepResult) -> None:
-        """Take in one cycle. Steps without a match teach nothing about its cost."""
+        """Updates the costs with one cycle. A step without a match gives no information on the cost of a match."""
         self._waited = 0 if limits.update_map else self._waited + 1
         us = spent.us if "match" in spent.us else {**spent.us, "match": spent.us.get("step", 0.0), "step": 0.0}
         if spent.light and "lights" in us:
@@ -211,7 +215,7 @@ class MeasuredBudget:
         self._rest.learn(sum(took for stage, took in us.items() if stage not in _APART))
         match = result.match
         if match is not None and match.iterations > 0 and match.queries > 0:
-            # of the fullest scan seen lately: thinned ones tell the cost of a pass, not how many a full one takes
+            # of the fullest recent scan: thinned scans give the cost of a pass, not the points of a full scan
             self._queries = max(match.queries, int(0.999 * self._queries))
             self._pass.learn(us.get("match", 0) / (FIXED + passes(match.iterations, match.queries)))
         if result.keyframe >= 0 and "map" in us:
@@ -228,20 +232,20 @@ class MeasuredBudget:
 
 
 def passes(iterations: int, points: int) -> float:
-    """Points that all iterations pass through: of a dense scan every fourth one, and all of them at last."""
+    """Returns the points that all iterations process: every fourth one of a dense scan, and all of them at the end."""
     if points <= DENSE:
         return iterations * points
     return iterations * points / COARSE + points
 
 
 _APART: Final = ("lights", "match", "map")
-"""Stages whose costs are known each for itself."""
+"""Stages whose costs are tracked separately."""
 
 
 class _Cost:
-    """What something costs, by the median of the latest few: up at once, down slowly.
+    """Cost estimate, us: the median of the latest measurements; it rises at once and falls slowly.
 
-    A cap that is too tight costs less than an overrun; one step during which another process ran says nothing.
+    A cap that is too tight costs less than an overrun. One step during which another process ran has no effect.
     """
 
     def __init__(self) -> None:

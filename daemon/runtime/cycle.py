@@ -1,10 +1,10 @@
-"""The cycle: take what has arrived, step the estimator, judge, publish.
+"""The localisation cycle: receives input, steps the estimator, updates the state, and publishes a snapshot.
 
-There is one per scan; without scans, one per block of light samples; and at 1.5 periods at the latest.
+A cycle runs for each scan; without scans, for each block of light samples; otherwise after 1.5 periods.
 
-:class:`Cycle` is synchronous and knows no timer, so that replay can drive it as well; `daemon.runtime.scheduler` runs
-it when it is due, in real or in virtual time. What a cycle consumed and decided goes to a tap as a
-:class:`CycleRecord`: with the raw streams that is all it takes to repeat the run exactly.
+:class:`Cycle` is synchronous and has no timer, so that a replay can drive it as well. `daemon.runtime.scheduler` runs
+it when it is due, in real or in virtual time. Each cycle gives a :class:`CycleRecord` of its input and decisions to an
+observer. Together with the raw streams, that record suffices to repeat the run exactly.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ from hal.lidar import Link
 log = logging.getLogger(__name__)
 
 OWN_SHARE: Final = 0.5
-"""Part of the scan period that is the budget where none is configured."""
+"""Share of the scan period that is the default budget."""
 
 
 class Cycle:
-    """One localisation cycle after the other. Devices call the ``inbox``; :meth:`run` does the rest.
+    """Runs one localisation cycle after the other. Devices fill the ``inbox``; :meth:`run` does the rest.
 
     Attributes:
-        cycles, overruns: so far. cycle_us: duration of the latest. failing: numbers of the sinks that raise.
-        verdict: what is said about the pose. result: of the latest step.
-        blocks: of light samples received so far. lamps: what is wrong with lamps and survey.
-        alarm: compares the bound on the position error with its limit. trust: of the latest cycle.
-        paused: by a command: map and laser are left alone, light and odometry carry the pose.
-        stage_timer: stages of the latest cycle. timing: quantiles, degradation and stalls as they are published.
+        cycles, overruns: so far. cycle_us: duration of the latest cycle, us. failing: numbers of the sinks that raise.
+        verdict: published state, reason and known axes. result: of the latest step.
+        blocks: of light samples received so far. lamps: monitor of lamps and survey.
+        alarm: compares the protection level with the alert limit. trust: of the latest cycle.
+        paused: by a command; map and lidar stay unused, light and odometry carry the pose.
+        stage_timer: stages of the latest cycle. timing: published quantiles, degradation and stalls.
     """
 
     def __init__(self, parts: Parts) -> None:
@@ -84,7 +84,7 @@ class Cycle:
         self.timing = TimingStatistics()
 
     def run(self) -> Snapshot:
-        """Run one cycle with whatever has arrived."""
+        """Runs one cycle with all pending input and returns the published snapshot."""
         timer = self.stage_timer
         timer.begin()
         self.cycles += 1
@@ -130,7 +130,7 @@ class Cycle:
                 self.paused = command.order is Order.PAUSE
 
     def _answers(self, t_mono: float) -> tuple[Answer, ...]:
-        """What the worker has found; during a pause it is kept for later, because the map is not to be touched."""
+        """Returns the finished job results; a pause holds them back, because the map must not change."""
         self._held += self.parts.worker.collect(t_mono)
         if self.paused:
             return ()
@@ -138,12 +138,12 @@ class Cycle:
         return answers
 
     def announce(self) -> None:
-        """Publish where we stand without running a cycle: while the estimator is still being loaded."""
+        """Publishes the present state without a cycle, while the estimator is still being loaded."""
         self._publish(self._builder.build(None, self.verdict, self._facts(self.parts.clock.now())))
 
     @property
     def map_id(self) -> int:
-        """Identity of the map frame, another one after every RESET, and once a stored map was let go of."""
+        """Identity of the map frame; it changes with every RESET and when a stored map is discarded."""
         return self._builder.map_id
 
     @map_id.setter
@@ -152,11 +152,11 @@ class Cycle:
 
     @property
     def budget_us(self) -> float:
-        """Microseconds that a cycle may take."""
+        """Budget of a cycle, us."""
         return self.parts.budget_us or OWN_SHARE * self.period.seconds * 1e6
 
     def _bridge(self, taken: Taken) -> list[Record]:
-        """SI records of everything taken; the estimator orders them by time itself."""
+        """Returns SI records of all input; the estimator itself sorts them by time."""
         records: list[Record] = []
         for reading in taken.odometry:
             jumps = self.odometry.jumps
@@ -176,7 +176,7 @@ class Cycle:
         return records
 
     def _light(self, samples: tuple[RawSamples, ...]) -> list[Record]:
-        """The blocks that can be used."""
+        """Returns the usable blocks of light samples."""
         bridge, watch = self.parts.samples, self.parts.blocks
         if bridge is None or watch is None:
             return []
@@ -190,7 +190,7 @@ class Cycle:
         return records
 
     def blocks_lost(self) -> int:
-        """Blocks of light samples that came to nothing: lost on their way, damaged, or without a cycle to take them."""
+        """Number of unusable blocks of light samples: lost in transfer, damaged, or not consumed by any cycle."""
         bridge, watch = self.parts.samples, self.parts.blocks
         if bridge is None or watch is None:
             return 0
@@ -201,12 +201,12 @@ class Cycle:
         return self.observer.silence(t_mono, self.period.seconds)
 
     def lidar_ok(self, t_mono: float) -> bool | None:
-        """Whether scans are coming; None where there is no lidar."""
+        """True while scans arrive; None where there is no lidar."""
         silence = self.lidar_silence(t_mono)
         return (silence is not None and silence < (1.0 - EARLY) * SILENT_PERIODS) if self.parts.lidar else None
 
     def _step(self, records: tuple[Record, ...]) -> Limits | None:
-        """Step the estimator under the budget's caps and return them; None where there was nothing to step over."""
+        """Steps the estimator under the caps of the budget and returns them; None if there were no records."""
         self._switched = ""
         if not records:
             return None
@@ -227,14 +227,14 @@ class Cycle:
         return limits
 
     def _carrier(self) -> bool:
-        """Whether light or odometry can carry the pose for a while."""
+        """True if light or odometry can carry the pose for a while."""
         if self.observer.odometry_ok(self.parts.clock.now()):
             return True
         lights = None if self.result is None else self.result.lights
         return lights is not None and lights.fix is Fix.GOOD and self.result is not None and self.result.placed
 
     def _tell_unused(self, limits: Limits) -> None:
-        """Tell the judge that the laser is left out, and why."""
+        """Sets in the observer whether the lidar is skipped, and why."""
         if self.paused or self.observer.unused is Cause.PAUSED:
             self._left_out.clear()
         overloaded = not self.paused and self._left_out.on_step(limits.level >= DegradationLevel.CARRIED)
@@ -247,7 +247,7 @@ class Cycle:
             self.lamps.on_step(t_mono, self.result.lights, fresh)
 
     def _judge(self, t_mono: float, records: tuple[Record, ...], fresh: StepResult | None) -> Memory:
-        """What may be said about the pose; a change goes to the log."""
+        """Updates state and reason, and logs a change."""
         evidence = self.observer.evidence(t_mono, self.period.seconds, self.parts.status, records, fresh)
         before, self.verdict = self.verdict, judge(self.verdict, evidence)
         compared = bool(self.lidar_ok(t_mono)) and self.observer.unused is None
@@ -260,7 +260,7 @@ class Cycle:
         return self.verdict
 
     def _trust(self, t_mono: float, evidence: Evidence) -> Trust:
-        """The bound on the error of the pose, as far as the state lets it stand, and whether it is above its limit."""
+        """Returns the protection level, where the state permits one, and the alert against its limit."""
         result, limit_m = self.result, self.alarm.limit_m or None
         gap = None if result is None else result.gap
         protection = None if result is None else result.protection
@@ -302,7 +302,7 @@ class Cycle:
         )
 
     def facts(self) -> CycleFacts:
-        """How cycles and their inputs are at this moment."""
+        """Returns the present facts on cycles and their input."""
         parts, inbox, watch, t_mono = self.parts, self.inbox, self.watch, self.parts.clock.now()
         result = self.result
         return CycleFacts(
@@ -352,7 +352,7 @@ class Cycle:
         )
 
     def _publish(self, snapshot: Snapshot) -> None:
-        """Hand the snapshot to every sink; a sink that raises harms neither the cycle nor the others."""
+        """Passes the snapshot to every sink; a sink that raises affects neither the cycle nor the other sinks."""
         for number, sink in enumerate(self.parts.sinks):
             try:
                 sink(snapshot)

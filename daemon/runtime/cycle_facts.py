@@ -1,4 +1,4 @@
-"""How cycles and their inputs are: the record that vitals, statistics and the stream's figures are taken from."""
+"""Facts record of the cycle and its inputs: source of the vitals, the log statistics and the stream's figures."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from hal.lidar import LidarStatus
 
 @dataclass(frozen=True, slots=True)
 class PhotodiodeFacts:
-    """The photodiode and its lamps.
+    """Facts on the photodiode and its lamps.
 
     Attributes:
-        ok: usable blocks come. status: of the driver, live.
-        blocks: received since the start. blocks_lost: those of no use, and those that were lost on their way.
-        blocks_dropped: that no cycle took. unfit: damaged. off_rate: clocked beyond the decoder's reach.
-        stalled: blocks in which the bus stood still. lamp_faults: of lamps and survey. links: in the latest result.
+        ok: usable blocks arrive. status: of the driver, live.
+        blocks: received since the start. blocks_lost: unusable ones, and those lost in transfer.
+        blocks_dropped: not consumed by any cycle. unfit: damaged. off_rate: sample clock outside the decoder's range.
+        stalled: blocks during which the bus stalled. lamp_faults: of lamps and survey. links: in the latest result.
     """
 
     ok: bool
@@ -35,20 +35,21 @@ class PhotodiodeFacts:
 
 @dataclass(frozen=True, slots=True)
 class CycleFacts:
-    """How cycles and their inputs are at one instant. Counters count since the start.
+    """Facts on cycles and their inputs at one instant. Counters count since the start.
 
     Attributes:
-        t_mono: the instant. state: what is said about the pose.
-        cycles, overruns: so far. cycle_us: duration of the latest. timing: quantiles and stalls.
-        short: cycles that left out map work or the laser for lack of time. period: of scans, s.
-        lidar: status of the driver, live. lidar_silent: scans came, and come no longer.
-        scans_dropped: that no cycle took. scans_late: that arrived late. scans_misfit: they are at odds with the map.
-        lag_s: estimated lag of the laser behind the wheels.
+        t_mono: the instant, s. state: published state.
+        cycles, overruns: so far. cycle_us: duration of the latest cycle, us. timing: quantiles and stalls.
+        short: cycles that skipped map work or the lidar for lack of time. period: of scans, s.
+        lidar: status of the driver, live. lidar_silent: scans have arrived before and do not arrive now.
+        scans_dropped: not consumed by any cycle. scans_late: arrived late. scans_misfit: inconsistent with the map.
+        lag_s: estimated delay of the lidar behind the odometry, s.
         odometry_ok: None where there is none. odometry_jumps: readings that no motion explains.
-        odometry_disagrees: with the laser. readings, readings_missed, readings_old: of odometry that came, were lost,
-            and came late. readings_seldom: they come more seldom than before.
-        photodiode: None where there is none. jobs_failed: of the worker. alert: the bound on the position error is
-            above its limit, and that has been logged. sink_failing: a publisher raises.
+        odometry_disagrees: with the lidar. readings, readings_missed, readings_old: odometry readings that arrived,
+        were
+            lost, and arrived late. readings_seldom: they arrive less often than before.
+        photodiode: None where there is none. jobs_failed: of the worker. alert: the protection level exceeds its limit,
+            and that has been logged. sink_failing: a publisher raises.
     """
 
     t_mono: float

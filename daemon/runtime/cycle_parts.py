@@ -1,4 +1,4 @@
-"""What a cycle is made of, and the record of what one cycle consumed and decided."""
+"""Components that a cycle is built from, and the record of the input and decisions of one cycle."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from hal.lidar import LidarStatus
 log = logging.getLogger(__name__)
 
 Sink = Callable[[Snapshot], None]
-"""Takes every snapshot; called from the loop thread, never waited for: it must return at once."""
+"""Receives every snapshot in the loop thread; the cycle never waits, so it must return at once."""
 Step = Callable[[tuple[Record, ...], Limits], StepResult]
-"""The estimator with its state inside."""
+"""Estimator step: records and caps to a result; the estimator state is inside."""
 
 
 @dataclass(frozen=True, slots=True)
 class CycleRecord:
-    """What one cycle consumed and decided.
+    """Input and decisions of one cycle.
 
     Attributes:
-        cycle: counts cycles from 1. t_mono: when it began.
-        scan: `RawScan.seq` of the scan consumed, None without one. dropped: those that a later scan replaced.
-        odometry, imu, samples: readings, and blocks of light samples, received since the start, all consumed by now.
-        commands: consumed. answers: job IDs of the answers applied, in order.
-        switched: SHA-256 of the stored map that the estimator has gone on in with this cycle, empty: none.
-        limits: the step's caps; None where nothing had arrived and no step was made.
-        result: of the step, or the previous one's; None before the first. snapshot: what was published.
+        cycle: number of the cycle, from 1. t_mono: its start, s.
+        scan: `RawScan.seq` of the consumed scan, None without one. dropped: scans that a later one replaced.
+        odometry, imu, samples: readings, and blocks of light samples, received since the start and consumed so far.
+        commands: consumed. answers: job IDs of the applied job results, in order.
+        switched: SHA-256 of the stored map that the estimator switched to in this cycle, empty: none.
+        limits: caps of the step; None if nothing had arrived and no step was made.
+        result: of the step, or the previous one's; None before the first. snapshot: as published.
         stage_us: measured microseconds by stage, empty without a stopwatch. waiting: `Link.WAITING` of the lidar.
     """
 
@@ -63,33 +63,33 @@ Tap = Callable[[CycleRecord], None]
 
 @dataclass(slots=True)
 class PendingSwitch:
-    """A switch to another stored map that the next step carries out.
+    """A switch to another stored map, which the next step carries out.
 
     Attributes:
-        take_over: has the estimator go on in the other map; returns the map's ID and the digest of its file. None:
-            there is no switch to carry out.
+        take_over: switches the estimator to the other map; returns the map's ID and the digest of its file. None: no
+            switch is pending.
     """
 
     take_over: Callable[[], tuple[int, str]] | None = None
 
     def carry_out(self) -> tuple[int, str] | None:
-        """Map ID and digest, once; None where there is no switch."""
+        """Carries out the switch once; returns map ID and digest, None if no switch is pending."""
         take_over, self.take_over = self.take_over, None
         return None if take_over is None else take_over()
 
 
 @dataclass(slots=True)
 class Parts:
-    """What a cycle is made of; every part can be replaced.
+    """Components of a cycle; each of them can be replaced.
 
     Attributes:
-        status: of the lidar driver, live. lidar, odometry: there is one.
+        status: of the lidar driver, live. lidar, odometry: whether there is one.
         samples, blocks: of the photodiode; None where there is none.
-        budget_us: time budget of a cycle, 0: half of the scan period.
+        budget_us: budget of a cycle, us; 0: half of the scan period.
         timer: of the stages; without a stopwatch nothing is measured, and nothing counts as overrun.
         inbox: filled by the devices. snapshots: builds what is published. switch: to another stored map.
-        fault: number of the gravest present fault. condition: how the daemon's parts are.
-        alert_m: limit of the position error above which an alert is raised, 0: none. t_begun: start of the run; 0: now.
+        fault: number of the gravest present fault. condition: health of the daemon's components.
+        alert_m: alert limit, m; 0: none. t_begun: start of the run, s; 0: now.
     """
 
     clock: Clock

@@ -1,7 +1,7 @@
-"""Degradation of cycles: down at once where the work does not fit, up one level at a time once it has long fitted.
+"""Degradation level of cycles: worse at once when the work does not fit, better by one level after it has long fitted.
 
-The order is fixed: fewer iterations and points, then no map work, then no laser. Costs swing from cycle to cycle; what
-is left out does not, or state and reason would flicker with it.
+The order is fixed: fewer iterations and points, then no map work, then no lidar. Costs vary from cycle to cycle. The
+level must not, or state and reason would flicker with it.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from typing import Final
 from estimator import DegradationLevel
 
 PATIENCE: Final = 20
-"""Cycles in a row that must fit a better level before it is taken."""
+"""Consecutive cycles that must fit a better level before it is selected."""
 LONGEST: Final = 640
-"""The patience of a degradation that has had to come down again and again: half a minute of cycles with light."""
+"""Largest patience after repeated degradations, cycles: half a minute of cycles with light."""
 RECENT: Final = 8
 MANY: Final = 3
-"""So many overruns of the latest cycles say that the costs as known are not the whole truth."""
+"""Overruns among the latest :data:`RECENT` cycles from which the estimated costs count as incomplete."""
 
 
 class Degradation:
-    """One for cycles with light and one for those without: they cost differently.
+    """One degradation for cycles with light and one for those without, because their costs differ.
 
     Attributes:
         level: the present one.
@@ -34,7 +34,7 @@ class Degradation:
         self._recent: deque[bool] = deque(maxlen=RECENT)
 
     def choose(self, fits: DegradationLevel) -> DegradationLevel:
-        """The level for a cycle, given the best one that its costs allow."""
+        """Returns the level for a cycle, given the best level that its costs permit."""
         if fits >= self.level:
             self.level, self._fitted = fits, 0
             return self.level
@@ -45,7 +45,7 @@ class Degradation:
         return self.level
 
     def ended(self, overran: bool, helps: bool) -> None:
-        """Take in how a cycle ended. ``helps``: the next level would leave out something that takes long."""
+        """Updates the level after a cycle. ``helps``: the next level would omit work that takes long."""
         self._recent.append(overran)
         if sum(self._recent) < MANY:
             return

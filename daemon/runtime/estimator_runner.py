@@ -1,4 +1,4 @@
-"""The estimator with its state, as the cycle steps it."""
+"""Estimator runner: loads the estimator, owns its state, and makes one step per cycle."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:  # the estimator is loaded in a thread, by the warm-up
 
 
 class EstimatorRunner:
-    """The estimator with its state; loaded with the first step at the latest, which the warm-up has made quick.
+    """The estimator with its state. It loads at the first step at the latest; the warm-up has made that quick.
 
     Args:
-        start: the map that it begins with. localise: maps are only used, never changed.
-        lap: called with the name of each part of a step that has ended.
+        start: initial map. localise: maps are only used, never changed.
+        lap: called with the name of each finished part of a step.
 
     Attributes:
         state: None until it is loaded.
@@ -44,18 +44,18 @@ class EstimatorRunner:
         self._step: Step | None = None
 
     def made(self, start: Start) -> State:
-        """A state as at a start in a stored map; may be called in another thread."""
+        """Returns a new state that starts in a stored map; may run in another thread."""
         import estimator
 
         return new_state(self._lights, estimator.Settings(), replace(start, localise=self.localise))
 
     def take_over(self, switch: Switch) -> None:
-        """Go on in another map."""
+        """Switches to another map."""
         assert self.state is not None
         take_over(self.state, switch.donor)
 
     def load(self) -> Step:
-        """Load the estimator, and the map into it."""
+        """Loads the estimator and its initial map; returns the step function."""
         import estimator
 
         self.state = new_state(self._lights, estimator.Settings(localise=self.localise), self.start)
@@ -63,6 +63,6 @@ class EstimatorRunner:
         return self._step
 
     def __call__(self, records: tuple[Record, ...], limits: Limits) -> StepResult:
-        """Make one step."""
+        """Makes one step."""
         step = self._step or self.load()
         return step(records, limits)

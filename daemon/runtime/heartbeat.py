@@ -1,4 +1,4 @@
-"""Once a second: is the loop on time, which faults are there; the watchdog is fed only while cycles go on."""
+"""Heartbeat: samples the vitals once a second, updates the faults, and feeds the watchdog only while cycles run."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ log = logging.getLogger(__name__)
 
 BEAT_S: Final = 1.0
 STATISTICS_BEATS: Final = 300
-"""Beats between two lines of statistics in the log; `systemctl status` shows the latest beat's."""
+"""Beats between two lines of statistics in the log; `systemctl status` shows the line of the latest beat."""
 OVER_S: Final = 3.0
-"""A fault is said to be over when it has been gone for this long: one that comes and goes is one fault."""
+"""Time without the fault, s, after which it counts as over; an intermittent fault stays one fault."""
 
 
 class Heartbeat:
-    """Samples the vitals and keeps the faults that follow from them.
+    """Samples the vitals and derives the faults from them.
 
     Args:
-        vitals: takes a sample, given the loop's lateness in seconds.
+        vitals: takes a sample, given the lateness of the loop in seconds.
         statistics: one line, for the service manager with every beat and for the log now and then.
-        alive: whether the threads answer; else the watchdog is not fed.
-        present: takes the faults that are found.
+        alive: whether all threads respond; otherwise the watchdog is not fed.
+        present: receives the detected faults.
     """
 
     def __init__(
@@ -46,21 +46,21 @@ class Heartbeat:
         self._statistics = statistics
         self._alive = alive
         self._samples: deque[Vitals] = deque()
-        self._seen: dict[Fault, tuple[float, float]] = {}  # those that have been said: when first and last present
+        self._seen: dict[Fault, tuple[float, float]] = {}  # logged faults: when first and last present
         self._beats = 0
         self._failing = False
         self._late = False
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """Those that are present, gravest first."""
+        """Present faults, gravest first."""
         return self._present.faults
 
     async def run(self) -> None:
-        """Beat until cancelled.
+        """Beats until cancelled.
 
-        A beat that fails does not feed the watchdog. It is said once, and the next one is tried: a defect in what only
-        looks must not end a daemon that localises, and one that lasts ends in a restart all the same.
+        A beat that fails does not feed the watchdog. It is logged once, and the next one is tried. A defect in the
+        monitoring must not end a daemon that localises; a lasting one ends in a restart all the same.
         """
         loop = asyncio.get_running_loop()
         due = loop.time()
@@ -77,17 +77,17 @@ class Heartbeat:
                 self._failing = False
 
     def beat(self, lateness: float) -> None:
-        """One beat; ``lateness``: seconds by which the loop was late for it."""
+        """Makes one beat; ``lateness``: delay of the loop at this beat, s."""
         now = self._vitals(lateness)
         if self._samples and self._samples[-1].cycles == 0:
-            self._samples.clear()  # what was lost while the estimator was being loaded is no fault
+            self._samples.clear()  # input lost while the estimator was being loaded is no fault
         self._samples.append(now)
         while len(self._samples) > 2 and now.t_mono - self._samples[1].t_mono >= WINDOW_S:
             self._samples.popleft()
         worst = max(sample.lateness for sample in self._samples)
         found = assess(replace(now, lateness=worst), self._samples[0])
         before, self._late = self._late, lateness > STALLED_PERIODS * now.period
-        if self._late and not before:  # what has arrived meanwhile nobody has taken yet: the next beat will know
+        if self._late and not before:  # input that arrived meanwhile is not consumed yet: the next beat decides
             found = tuple(fault for fault in found if fault is Fault.LOOP_STALLED or fault in self.faults)
         self._tell(now, found)
         if (len(self._samples) < 2 or now.cycles > self._samples[-2].cycles) and self._alive():
@@ -100,7 +100,7 @@ class Heartbeat:
             log.info("%s", statistics)
 
     def _tell(self, now: Vitals, faults: tuple[Fault, ...]) -> None:
-        """Each fault is said once when it comes, in its device's own words, and once when it has gone for good."""
+        """Logs each fault once when it appears, in its device's own words, and once when it is over."""
         for fault in faults:
             if fault not in self._seen:
                 log.warning("%s", describe(fault, now), extra=of_fault(fault))

@@ -1,4 +1,4 @@
-"""A histogram of durations of constant size over the last half minute to minute, and its quantiles."""
+"""Histogram of durations over the last 30 to 60 s in constant memory, with its quantiles."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Final
 from daemon.snapshot import Spread
 
 HALF_S: Final = 30.0
-"""Two halves are kept, and the older one goes when the newer is as long as this."""
+"""Duration of a half, s. Two halves are kept; the older one is dropped when the newer one is complete."""
 FINE: Final = 4
-"""Bits kept of a number beside its leading one: a quantile is at most 1/16 too large, and never too small."""
+"""Bits kept after the leading one: a quantile is at most 1/16 too large, and never too small."""
 
 
 class Histogram:
-    """Counts of microseconds, in steps of at most 1/16."""
+    """Counts of durations, us, in bins of at most 1/16 relative width."""
 
     def __init__(self) -> None:
         self._older: dict[int, int] = {}
@@ -21,7 +21,7 @@ class Histogram:
         self._older_max = self._newer_max = 0
 
     def add(self, us: int) -> None:
-        """Count one."""
+        """Counts one duration, us."""
         shift = us.bit_length() - FINE - 1
         step = (shift << FINE) + (us >> shift) if shift > 0 else us
         self._newer[step] = self._newer.get(step, 0) + 1
@@ -29,12 +29,12 @@ class Histogram:
             self._newer_max = us
 
     def turn(self) -> None:
-        """Forget the older half."""
+        """Drops the older half."""
         self._older, self._older_max = self._newer, self._newer_max
         self._newer, self._newer_max = {}, 0
 
     def spread(self) -> Spread | None:
-        """Median, 99 of 100, largest; None where nothing was counted."""
+        """Returns median, 99 % quantile and maximum, us; None if nothing was counted."""
         counts = dict(self._older)
         for step, count in self._newer.items():
             counts[step] = counts.get(step, 0) + count
@@ -47,7 +47,7 @@ class Histogram:
 
 
 def _step_at(counts: dict[int, int], rank: float) -> int:
-    """The step that the ``rank``-th smallest number fell into."""
+    """Returns the bin of the ``rank``-th smallest value."""
     below, last = 0, 0
     for last in sorted(counts):
         below += counts[last]
@@ -57,6 +57,6 @@ def _step_at(counts: dict[int, int], rank: float) -> int:
 
 
 def _upper(step: int) -> int:
-    """Largest number of a step."""
+    """Returns the largest value of a bin, us."""
     shift = max(0, (step >> FINE) - 1)
     return ((step - (shift << FINE) + 1) << shift) - 1

@@ -1,4 +1,4 @@
-"""What has arrived since the last cycle: one scan (the latest wins), some sample blocks, odometry, gyro, commands."""
+"""Inbox of the cycle: latest scan, some sample blocks, odometry, gyro readings and commands since the last cycle."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from hal.lidar import RawScan
 from hal.odometry import RawOdometry
 
 DEEPEST: Final = 256
-"""Readings held of one kind. Beyond, every other one goes: odometry is cumulative, so no motion is lost with it."""
+"""Readings held of one kind. Beyond, every other one is dropped; odometry is cumulative, so no motion is lost."""
 
 BLOCKS: Final = 4
-"""Sample blocks held: 0.2 s of light. Beyond, the oldest goes and is counted; each has a time base of its own."""
+"""Sample blocks held: 0.2 s of light. Beyond, the oldest is dropped and counted; each has its own time base."""
 
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """What one cycle consumes.
+    """Input of one cycle.
 
     Attributes:
         dropped: sequence numbers of scans that a later one has replaced.
-        odometry_total, imu_total: readings received since the start, all of them consumed with this cycle.
-        samples: blocks, oldest first. samples_total: received since the start, consumed by now or dropped.
+        odometry_total, imu_total: readings received since the start, all consumed with this cycle.
+        samples: blocks, oldest first. samples_total: received since the start, consumed so far or dropped.
     """
 
     scan: RawScan | None
@@ -41,11 +41,11 @@ class Taken:
 
 
 class Inbox:
-    """Filled by the devices' callbacks, emptied by the cycle; never longer than :data:`DEEPEST`.
+    """Buffer that device callbacks fill and the cycle empties; never longer than :data:`DEEPEST`.
 
     Attributes:
-        dropped, blocks_dropped: scans, and sample blocks, that no cycle took.
-        wheels: when odometry readings arrived.
+        dropped, blocks_dropped: scans, and sample blocks, that no cycle consumed.
+        wheels: arrival times of odometry readings.
     """
 
     def __init__(self) -> None:
@@ -62,18 +62,18 @@ class Inbox:
         self._samples_total = 0
 
     def begin(self) -> None:
-        """Cycles begin: what came before there was anyone to take it is no loss."""
+        """Resets the loss counters at the first cycle; input before it is no loss."""
         self.dropped = self.blocks_dropped = 0
 
     def put_scan(self, scan: RawScan) -> None:
-        """Hold a scan; one that no cycle has taken yet is dropped for it and counted."""
+        """Holds a scan; a scan that no cycle has consumed yet is dropped and counted."""
         if self._scan is not None:
             self._dropped.append(self._scan.seq)
             self.dropped += 1
         self._scan = scan
 
     def put_samples(self, block: RawSamples) -> None:
-        """Hold a block; the oldest makes way for it where there are too many."""
+        """Holds a block; drops the oldest one if there are too many."""
         self._samples_total += 1
         self._samples.append(block)
         if len(self._samples) > BLOCKS:
@@ -81,7 +81,7 @@ class Inbox:
             self.blocks_dropped += 1
 
     def put_odometry(self, reading: RawOdometry) -> None:
-        """Hold a cumulative reading."""
+        """Holds a cumulative reading."""
         self._odometry_total += 1
         self.wheels.on_reading(reading.t_rx)
         self._odometry.append(reading)
@@ -89,18 +89,18 @@ class Inbox:
             self._odometry = self._odometry[::2]
 
     def put_imu(self, reading: RawImu) -> None:
-        """Hold a gyro reading."""
+        """Holds a gyro reading."""
         self._imu_total += 1
         self._imu.append(reading)
         if len(self._imu) > DEEPEST:
             del self._imu[0]
 
     def put_command(self, command: Command) -> None:
-        """Hold an order; the latest few are kept."""
+        """Holds a command; only the latest ones are kept."""
         self._commands = [*self._commands, command][-DEEPEST:]
 
     def drain(self) -> Taken:
-        """Everything that is held; the inbox is empty afterwards."""
+        """Returns all input and empties the inbox."""
         taken = Taken(
             self._scan,
             tuple(self._dropped),

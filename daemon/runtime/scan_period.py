@@ -1,4 +1,4 @@
-"""The scan period as it really is, learned from the stamps; a nominal 25 ms sensor may well turn in 25.05."""
+"""Scan period learned from the scan stamps; a sensor with nominally 25 ms may in fact take 25.05 ms."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Final
 from hal.lidar import RawScan
 
 IDLE_PERIOD_S: Final = 0.1
-"""What is taken for the period before any lidar has said its own."""
+"""Period before any lidar has reported its own, s."""
 MEDIAN_OF: Final = 31
 ENOUGH: Final = 5
 
 
 class ScanPeriod:
-    """Median time between consecutive scans: missing revolutions and stamps that run backwards do not move it.
+    """Median time between consecutive scans, s; missing scans and stamps that run backwards do not change it.
 
-    Where there has never been a scan, blocks of light samples set the pace.
+    Where there has never been a scan, blocks of light samples set the period.
     """
 
     def __init__(self) -> None:
@@ -27,11 +27,11 @@ class ScanPeriod:
 
     @property
     def seconds(self) -> float:
-        """The period: learned, else nominal, else :data:`IDLE_PERIOD_S`."""
+        """Period, s: learned, else nominal, else :data:`IDLE_PERIOD_S`."""
         return self._nominal if len(self._steps) < ENOUGH else self._median
 
     def learn(self, scan: RawScan) -> None:
-        """Take in one scan's stamp."""
+        """Updates the period with the stamp of one scan."""
         if scan.geometry.period_s > 0.0:
             self._nominal = scan.geometry.period_s
         last, self._last = self._last, (scan.seq, scan.t_mono)
@@ -40,9 +40,9 @@ class ScanPeriod:
         step = (scan.t_mono - last[1]) / (scan.seq - last[0])
         if step > 0.0:
             self._steps.append(step)
-            self._median = sorted(self._steps)[len(self._steps) // 2]  # asked for ten times a cycle
+            self._median = sorted(self._steps)[len(self._steps) // 2]  # read ten times a cycle
 
     def learn_block(self, seconds: float) -> None:
-        """Take in the length of a block of light samples."""
+        """Sets the nominal period to the length of a block of light samples, s, until a scan arrives."""
         if self._last is None:
             self._nominal = seconds

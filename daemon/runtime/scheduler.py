@@ -1,4 +1,4 @@
-"""When cycles begin: with a scan; without scans, with a block of light samples; and at 1.5 periods at the latest."""
+"""Cycle scheduler: starts a cycle with a scan; without scans, with a sample block; otherwise after 1.5 periods."""
 
 from __future__ import annotations
 
@@ -14,26 +14,29 @@ from hal.timerfd import timer
 IDLE_PERIODS: Final = 1.5
 """Scan periods after which a cycle starts without a scan."""
 STALL_PERIODS: Final = 2.0
-"""Periods beyond the idle one after which the loop is said to have stood still."""
+"""Periods beyond the idle one after which the loop counts as stalled."""
 
 
 class Watch(Protocol):
-    """Says what ran when the loop stood still (`daemon.runtime.stall_watch.StallWatch`)."""
+    """Finds what ran while the loop was stalled (`daemon.runtime.stall_watch.StallWatch`)."""
 
     def arm(self, seconds: float) -> float | None:
-        """A cycle begins, the next one has to within ``seconds``. Seconds since the last, if that was not so."""
+        """Restarts the timer of ``seconds`` at the start of a cycle.
+
+        Returns the seconds since the last start if it expired.
+        """
         ...
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stops watching."""
         ...
 
 
 class Pacemaker:
-    """Starts a cycle when a scan is complete; without scans, when a block of light samples is, or after a while.
+    """Starts a cycle when a scan is complete; without scans, when a sample block is complete, or after the idle time.
 
     Attributes:
-        watch: of stalls; None: nobody watches.
+        watch: of stalls; None: no watch.
     """
 
     def __init__(self, cycle: Cycle) -> None:
@@ -44,12 +47,12 @@ class Pacemaker:
         self._latest = 0.0
 
     def on_scan(self, scan: RawScan) -> None:
-        """Take a scan from the driver; the cycle starts in the next turn of the loop, with the latest by then."""
+        """Receives a scan; the cycle starts in the next turn of the loop, with the latest scan by then."""
         self._cycle.inbox.put_scan(scan)
         self._wake(scan.t_rx)
 
     def on_samples(self, block: RawSamples) -> None:
-        """Take a block from the converter's driver; the next scan's cycle takes it along, if there are scans."""
+        """Receives a sample block; the cycle of the next scan consumes it, if there are scans."""
         cycle = self._cycle
         cycle.inbox.put_samples(block)
         silence = cycle.lidar_silence(cycle.parts.clock.now())
@@ -57,15 +60,12 @@ class Pacemaker:
             self._wake(cycle.parts.clock.now())
 
     def latest(self) -> float:
-        """Seconds by which the loop was late for a cycle when it stood still since this was last asked; 0: it did not.
-
-        Of several times it is the worst.
-        """
+        """Returns the delay of the loop in its worst stall since the last call, s; 0 if there was none."""
         latest, self._latest = self._latest, 0.0
         return latest
 
     async def run(self) -> None:
-        """Run cycles until cancelled."""
+        """Runs cycles until cancelled."""
         loop, cycle = asyncio.get_running_loop(), self._cycle
         idle_until = 0.0
         idle = timer(loop, lambda: self._wake(idle_until))
@@ -86,7 +86,7 @@ class Pacemaker:
                 self.watch.close()
 
     def _watch_stalls(self, period: float) -> None:
-        """A cycle begins; if it should have long ago, count that, with the stage in which it was."""
+        """Counts a stall before this cycle, with the stage in which it occurred."""
         cycle = self._cycle
         if self.watch is None or (lasted := self.watch.arm((IDLE_PERIODS + STALL_PERIODS) * period)) is None:
             return

@@ -1,4 +1,4 @@
-"""Builds the snapshot: one step's result with its age, the pose carried to now, and the state that was judged."""
+"""Snapshot builder: one step's result with its age, the pose predicted to now, and the published state."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from estimator import LoopReason as Why
 Triple = tuple[float, float, float]
 
 UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING)
-"""Links that are listed and not received."""
+"""Link states of lamps that are listed and not received."""
 NO_TRUST: Final = Trust()
 USES: Final = {state: LinkUse.__members__.get(state.name, LinkUse.OTHER) for state in LinkState}
 LOOPS: Final = {why: LoopReason.__members__.get(why.name, LoopReason.OTHER) for why in Why}
 LONGEST_CARRY_PERIODS: Final = 3.0
-"""A velocity is not carried further than this many scan periods; beyond, nothing is predicted."""
+"""Scan periods over which the velocity extrapolates the pose; beyond, there is no prediction."""
 
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What the daemon knows besides the estimate; see `Snapshot` for the meaning of each."""
+    """What the daemon adds to the estimate; see `Snapshot` for the meaning of each."""
 
     t_mono: float = 0.0
     t_utc: float = 0.0
@@ -59,10 +59,10 @@ class Facts:
 
 @dataclass(slots=True)
 class SnapshotBuilder:
-    """Numbers the snapshots and remembers the latest loop.
+    """Numbers the snapshots and stores the latest loop closure.
 
     Attributes:
-        map_id: identity of the map frame, 0: not known. loop_seen: how many loops somebody has seen, modulo 65536.
+        map_id: identity of the map frame, 0: not known. loop_seen: loops acknowledged by a client, modulo 65536.
     """
 
     map_id: int = 0
@@ -72,17 +72,17 @@ class SnapshotBuilder:
     _links: tuple[tuple[Link, ...], tuple[LightLink, ...]] = ((), ())
 
     def on_loops_seen(self, counter: int) -> None:
-        """Somebody has seen so many loops; see `Snapshot.loop_latched`."""
+        """Stores the number of loops that a client has acknowledged; see `Snapshot.loop_latched`."""
         self.loop_seen = counter
 
     def build(self, result: StepResult | None, verdict: Memory, facts: Facts) -> Snapshot:
-        """One snapshot of this moment."""
+        """Returns a snapshot of this cycle."""
         self._seq += 1
         if result is not None and result.loop is not None:
             self._loop = result.loop
         loop = self._loop
         estimate = None if result is None or not math.isfinite(result.t_mono) else result
-        guessed = estimate is not None and estimate.places is not None  # how sure a guess is, nobody knows
+        guessed = estimate is not None and estimate.places is not None  # an unconfirmed pose has no known covariance
         received = _received(result, facts)
         return Snapshot(
             seq=self._seq,
@@ -122,7 +122,7 @@ class SnapshotBuilder:
         )
 
     def _shown(self, result: StepResult | None) -> tuple[LightLink, ...]:
-        """The first links as they are published; every other cycle brings no new ones."""
+        """Returns the first links as they are published, cached: every other cycle has no new ones."""
         links = () if result is None or result.lights is None else result.lights.links
         if links is not self._links[0]:
             self._links = links, tuple([_link(link) for link in links[:LISTED_LINKS]])
@@ -130,14 +130,14 @@ class SnapshotBuilder:
 
 
 def _received(result: StepResult | None, facts: Facts) -> list[Link]:
-    """Links that are above the noise, strongest first; none while no samples come."""
+    """Returns the links above the noise, largest RSS first; empty while no samples arrive."""
     if result is None or result.lights is None or not facts.adc_ok:
         return []
     return [link for link in result.lights.links if link.state not in UNHEARD]
 
 
 def _light(result: StepResult | None, facts: Facts, links: tuple[LightLink, ...]) -> LightPicture:
-    """What lights alone say; nothing while no samples come, however well the place was known before."""
+    """Returns the light solution; without samples only the block counts, however good the fix was before."""
     if result is None or result.lights is None or not facts.adc_ok:
         return LightPicture(blocks=facts.blocks, blocks_lost=facts.blocks_lost)
     lights = result.lights
@@ -166,7 +166,10 @@ def _pose(result: StepResult) -> Triple:
 
 
 def _aged(result: StepResult, facts: Facts) -> Array:
-    """The covariance now: a robot that nothing has told of since may have moved, as the next step will reckon."""
+    """Returns the covariance at the present time.
+
+    Without input the robot may have moved; the next step uses the same growth.
+    """
     from estimator import LARGEST_TURN, LONGEST_CARRY_S, UNSEEN  # loaded by the warm-up
 
     unseen = facts.t_mono - result.t_mono - LONGEST_CARRY_S
@@ -177,7 +180,7 @@ def _aged(result: StepResult, facts: Facts) -> Array:
 
 
 def _predicted(result: StepResult, facts: Facts) -> Triple | None:
-    """The pose carried to now at constant velocity; None where the velocity is too old to say anything."""
+    """Returns the pose predicted to now at constant velocity; None if the velocity is too old."""
     ahead = facts.t_mono - result.t_mono
     if ahead > LONGEST_CARRY_PERIODS * facts.period:
         return None

@@ -1,4 +1,4 @@
-"""Microseconds per stage of a cycle, what they come to over the last minute, and where the time of a stall went."""
+"""Stage times of a cycle in us, their quantiles over the last minute, and the stage of a stall."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from estimator import DegradationLevel
 
 NAMES: Final = {stage.name.lower(): stage for stage in Stage}
 REFRESH_S: Final = 1.0
-"""Quantiles are worked out so often."""
+"""Interval between updates of the quantiles, s."""
 
 
 class StageTimer:
-    """The stages of the cycle that is running, by name; empty without a stopwatch."""
+    """Stage times of the running cycle by name, us; empty without a stopwatch."""
 
     def __init__(self, stopwatch: Callable[[], float] | None) -> None:
         self.us: dict[str, int] = {}
@@ -25,17 +25,17 @@ class StageTimer:
 
     @property
     def measures(self) -> bool:
-        """Whether there is a stopwatch."""
+        """True if there is a stopwatch."""
         return self._stopwatch is not None
 
     def begin(self) -> None:
-        """A cycle begins."""
+        """Starts the timing of a cycle."""
         self.us = {}
         if self._stopwatch is not None:
             self._last = self._stopwatch()
 
     def lap(self, stage: str) -> None:
-        """What has passed since the last lap belongs to this stage."""
+        """Adds the time since the last call to this stage."""
         if self._stopwatch is None:
             return
         now = self._stopwatch()
@@ -43,15 +43,15 @@ class StageTimer:
         self._last = now
 
     def longest(self) -> Stage:
-        """The stage that has taken longest."""
+        """Returns the stage with the largest time."""
         return NAMES.get(max(self.us, key=self.us.__getitem__), Stage.STEP) if self.us else Stage.OUTSIDE
 
 
 class TimingStatistics:
-    """Counts degradation levels, stalls and microseconds, and tells them as a :class:`CycleTiming`.
+    """Counts degradation levels and stalls, keeps stage-time histograms, and publishes a :class:`CycleTiming`.
 
     Attributes:
-        short: cycles that left out map work or the laser for lack of time.
+        short: cycles that skipped map work or the lidar for lack of time.
     """
 
     def __init__(self) -> None:
@@ -62,11 +62,11 @@ class TimingStatistics:
         self._refresh = self._turn = 0.0
 
     def late(self, seconds: float) -> None:
-        """A cycle begins so long after it was due."""
+        """Counts the start delay of a cycle, s."""
         self._late.add(max(0, round(seconds * 1e6)))
 
     def on_level(self, level: int, paused: bool = False) -> None:
-        """A step was made at this level."""
+        """Counts a step at this level."""
         pulse = self.latest
         self.short += level >= DegradationLevel.NO_MAP and not paused
         if level == DegradationLevel.FULL and pulse.rung == DegradationLevel.FULL:
@@ -80,11 +80,11 @@ class TimingStatistics:
         )
 
     def stalled(self, seconds: float, where: Stage) -> None:
-        """No cycle began for so long."""
+        """Counts a stall: no cycle began for ``seconds``."""
         self.latest = replace(self.latest, stalls=self.latest.stalls + 1, stall_s=seconds, stall_in=where)
 
     def on_cycle(self, t_mono: float, us: dict[str, int]) -> None:
-        """Take in the stages of a cycle that has ended."""
+        """Adds the stage times of a finished cycle."""
         if not us:
             return
         self._cycle.add(sum(us.values()))

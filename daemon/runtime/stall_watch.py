@@ -1,8 +1,8 @@
-"""Stall watch: when no cycle begins for two periods, logs what the loop's thread was doing and waiting for.
+"""Stall watch: when no cycle begins for two periods, logs what the loop thread was doing and waiting for.
 
-One interval timer of the kernel, put forward at every cycle (about a microsecond); nothing runs while all is well.
-Where it goes off, Python calls the handler in the loop's thread between two instructions, with the frame that was
-running. Threads that keep the interpreter are seen too: the handler then comes late, with the frame that waited.
+One interval timer of the kernel is restarted at every cycle (about a microsecond); nothing else runs in normal
+operation. When it expires, Python calls the handler in the loop thread between two instructions, with the running
+frame. Threads that hold the interpreter are found too: the handler then comes late, with the frame that waited.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from typing import Final
 log = logging.getLogger(__name__)
 
 AGAIN_S: Final = 10.0
-"""Stalls are counted all; a line in the log goes with the first of so long."""
+"""Minimum interval between two log lines on stalls, s; all stalls are counted."""
 SHARE: Final = 0.5
-"""Part of a stall that one thing has to make up to be called its cause."""
+"""Share of a stall that a single cause must make up to be named."""
 MUCH_S: Final = 0.01
-"""A loop at rest looks around sooner than this, if it may."""
+"""Handler delay, s, above which the loop thread was held up; a loop at rest handles the signal sooner."""
 OWN: Final = Path(__file__).resolve().parents[2]
 DEEP: Final = 3
-"""Functions named, the innermost ones of ours."""
+"""Number of our innermost functions that are named."""
 IDLE: Final = ("select", "wait", "get", "_wait_for_tstate_lock", "sleep", "poll")
-"""Functions in which a thread waits and holds nobody up."""
+"""Functions in which a thread waits without delaying others."""
 
 
 @dataclass(frozen=True, slots=True)
 class Caught:
-    """What was found when the timer went off.
+    """State at the expiry of the timer.
 
     Attributes:
-        where: in which functions the loop's thread was, empty: at rest. task: which one it was about.
-        others: other threads at work, and where. late: seconds until the loop's thread got to look around.
+        where: functions that the loop thread was in, empty: at rest. task: name of its task.
+        others: other active threads, and their functions. late: delay of the handler in the loop thread, s.
     """
 
     where: str
@@ -71,7 +71,10 @@ class StallWatch:
         self._before = signal.signal(signal.SIGALRM, self._ring)
 
     def arm(self, seconds: float) -> float | None:
-        """A cycle begins, the next one has to within ``seconds``. Seconds since the last, if that was not so."""
+        """Restarts the timer of ``seconds`` at the start of a cycle.
+
+        Returns the seconds since the last start if it expired.
+        """
         now, cpu = time.monotonic(), time.thread_time()
         caught, self._caught = self._caught, None
         signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -84,7 +87,7 @@ class StallWatch:
         return lasted
 
     def close(self) -> None:
-        """Stop watching; idempotent."""
+        """Stops watching; idempotent."""
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         if signal.getsignal(signal.SIGALRM) == self._ring:
             signal.signal(signal.SIGALRM, self._before)
@@ -93,13 +96,13 @@ class StallWatch:
         self._schedstat = -1
 
     def _ring(self, number: int, frame: FrameType | None) -> None:
-        """The timer has gone off: look around. Nothing here waits."""
+        """Captures the state when the timer expires; never blocks."""
         if self._caught is None:
             late = max(0.0, time.monotonic() - self._due)
             self._caught = Caught(place(frame), _task(), self._others(), late)
 
     def _others(self) -> str:
-        """Which of our other threads are at work, and where."""
+        """Returns our other active threads and their functions, as text."""
         names = {thread.ident: thread.name for thread in threading.enumerate()}
         found = []
         for ident, frame in sys._current_frames().items():
@@ -116,11 +119,11 @@ class StallWatch:
         stolen = self._stolen()
         waited = None if stolen is None or self._kept is None else stolen - self._kept
         self.said = f"no cycle began for {lasted:.3f} s: {cause(caught, lasted, worked, waited)}{more}"
-        log.info("%s", self.said)  # long ones are a fault, which warns
+        log.info("%s", self.said)  # a long stall is a fault with its own warning
         self._said_at, self._unsaid = now, 0
 
     def _stolen(self) -> float | None:
-        """Seconds for which this thread could have run, and another program did; None where the kernel does not say."""
+        """Seconds for which this thread was ready while another program ran; None if the kernel has no such figure."""
         try:
             return int(os.pread(self._schedstat, 100, 0).split()[1]) * 1e-9
         except (OSError, IndexError, ValueError):
@@ -128,7 +131,7 @@ class StallWatch:
 
 
 def cause(caught: Caught, lasted: float, worked: float, waited: float | None) -> str:
-    """Whose fault it was: own work, another program, another thread of ours, or a call that did not return."""
+    """Returns the cause of a stall: own work, another program, another thread of ours, or a blocking call."""
     task = f" (task {caught.task})" if caught.task else ""
     if worked >= SHARE * lasted:
         return f"{caught.where or 'the loop'}{task} ran for {worked:.3f} s"
@@ -142,7 +145,7 @@ def cause(caught: Caught, lasted: float, worked: float, waited: float | None) ->
 
 
 def place(frame: FrameType | None) -> str:
-    """The innermost functions of ours below a frame, the outer one first; empty where there is none: the loop waits."""
+    """Returns our innermost functions on the stack, the outer one first; empty if the loop was waiting."""
     names: list[str] = []
     inner = frame
     while inner is not None and len(names) < DEEP:
@@ -157,7 +160,7 @@ def place(frame: FrameType | None) -> str:
 
 
 def _resting(name: str) -> bool:
-    """Whether the innermost function of ours is only the one that runs the loop."""
+    """True if our innermost function is only the one that runs the loop."""
     return name.endswith((".main", ".run", ".<module>"))
 
 
@@ -169,7 +172,7 @@ def _open(path: str) -> int:
 
 
 def _task() -> str:
-    """The task that is running, by name."""
+    """Returns the name of the running task."""
     try:
         task = asyncio.current_task()
     except RuntimeError:

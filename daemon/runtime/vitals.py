@@ -1,4 +1,4 @@
-"""Vitals for the heartbeat and the line of statistics, from the facts about the cycle and the process."""
+"""Vitals for the heartbeat and the line of statistics, from the facts on the cycle and the process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from daemon.snapshot import CycleTiming
 
 
 def vitals(facts: CycleFacts, failed: set[str], lateness: float) -> Vitals:
-    """The vitals of this moment; ``failed``: names of parts that are down, ``lateness``: of the loop, seconds."""
+    """Returns the present vitals; ``failed``: names of failed components, ``lateness``: of the loop, s."""
     lidar = facts.lidar
     return Vitals(
         t_mono=facts.t_mono,
@@ -47,7 +47,7 @@ def vitals(facts: CycleFacts, failed: set[str], lateness: float) -> Vitals:
 
 
 def _photodiode(facts: CycleFacts) -> dict[str, Any]:
-    """The part of the vitals that is the photodiode's; nothing where there is none."""
+    """Returns the vitals of the photodiode; empty where there is none."""
     photodiode = facts.photodiode
     if photodiode is None:
         return {}
@@ -65,7 +65,7 @@ def _photodiode(facts: CycleFacts) -> dict[str, Any]:
 
 
 def statistics(facts: CycleFacts) -> str:
-    """One line for the log."""
+    """Returns one line for the log."""
     lidar = facts.lidar
     return (
         f"state {facts.state.name} cycles {facts.cycles} overruns {facts.overruns} scans {lidar.scans} "
@@ -76,7 +76,7 @@ def statistics(facts: CycleFacts) -> str:
 
 
 def _cycle_statistics(timing: CycleTiming) -> str:
-    """How long cycles take and how late they begin, over the last minute, and what they leave out."""
+    """Returns cycle durations and start delays over the last minute, and the degradation level, as text."""
     parts = [f"rung {timing.rung} stalls {timing.stalls}"]
     for name, spread in (("cycle", timing.cycle), ("late", timing.late)):
         if spread is not None:
@@ -93,7 +93,7 @@ def _light_statistics(facts: CycleFacts) -> str:
 
 
 def resident_mb() -> float:
-    """Resident memory of this process, MB; NaN where that cannot be read, as without a free file descriptor."""
+    """Resident memory of this process, MB; NaN where it cannot be read, as without a free file descriptor."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:

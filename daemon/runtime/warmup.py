@@ -1,8 +1,8 @@
-"""Loads the estimator once: the first start ever compiles its kernels, under a lock, every later one loads them.
+"""Warm-up: loads the estimator, and compiles its kernels under a lock at the first start.
 
-Importing the estimator is what compiles. Two processes that do so at once could spoil the cache's index, hence the lock
-(`daemon.system.kernel_lock`), which who finds all of them there does not need; and the daemon wants to go on talking to
-its devices meanwhile, hence the thread.
+Importing the estimator compiles the kernels; later starts load them from the cache. Two processes that compile at once
+could damage the cache's index; hence the lock (`daemon.system.kernel_lock`), which is not needed if all kernels are
+present. The daemon must keep communicating with its devices meanwhile; hence the thread.
 """
 
 from __future__ import annotations
@@ -44,26 +44,26 @@ MAKE: Final = frozenset({
     "vendor_id", "cpu family", "model", "model name", "stepping", "flags",
     "CPU implementer", "CPU architecture", "CPU variant", "CPU part", "CPU revision", "Features",
 })  # fmt: skip
-"""Of an x86 processor, and of an ARM one."""
+"""Keys in /proc/cpuinfo of the processor's type, for x86 and for ARM."""
 REPORT_S: Final = 5.0
 """Seconds between two progress lines."""
 _one: Final = threading.Lock()
-"""Of those that load in one process."""
+"""Serialises loading within one process."""
 LOOK_S: Final = 0.5
-"""Seconds between two looks for the first kernel that has been compiled."""
+"""Interval between two checks for the first compiled kernel, s."""
 
 
 class CannotLoad(Exception):
-    """The estimator cannot be loaded; the text says why and what to do."""
+    """The estimator cannot be loaded; the text gives the cause and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class Warmth:
-    """How the warm-up went.
+    """Result of the warm-up.
 
     Attributes:
-        compiled: kernels had to be compiled. seconds: it took. code_us: microseconds that the search for one light code
-            takes here, 0 without lights.
+        compiled: kernels had to be compiled. seconds: duration, s. code_us: cost of the search for one light code on
+            this computer, us; 0 without lights.
     """
 
     compiled: bool
@@ -72,10 +72,10 @@ class Warmth:
 
 
 async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | None = None) -> Warmth:
-    """Load the estimator in a thread; ``progress`` gets a line every few seconds while kernels are being compiled.
+    """Loads the estimator in a thread; ``progress`` receives a line every few seconds while kernels compile.
 
-    A stop during the first start does not wait for the compiler.
-    What belongs to light is loaded only where ``lights`` says that there is a photodiode.
+    A stop during the first start does not wait for the compiler. The packages for light are loaded only if ``lights``
+    is given.
     """
     begun = time.monotonic()
     loading = run_in_thread(load if lights is None else partial(load, lights), "warm-up")
@@ -85,19 +85,19 @@ async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | N
             progress(line)
     warmth = loading.result()
     gc.collect()
-    gc.freeze()  # what exists now stays: the collector need not walk through it during a cycle
+    gc.freeze()  # present objects stay: the collector need not scan them during a cycle
     if warmth.compiled:
         progress(f"kernels compiled in {warmth.seconds:.0f} s; later starts load them in less than a second")
     return warmth
 
 
 def load(lights: Lights | None = None) -> Warmth:
-    """Import and exercise the estimator. Blocks; for a thread, or for a command that may wait.
+    """Imports and exercises the estimator. Blocks; for a thread, or for a command that may wait.
 
-    Where kernels are missing it waits until no other process compiles any; where none are, for nobody.
+    If kernels are missing, it waits until no other process compiles any; otherwise it waits for no process.
 
     Raises:
-        CannotLoad: nowhere to keep compiled kernels, or memory must not be made executable here.
+        CannotLoad: there is no folder for compiled kernels, or memory must not be made executable here.
     """
     begun = time.monotonic()
     try:
@@ -113,10 +113,10 @@ def load(lights: Lights | None = None) -> Warmth:
 
 
 def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object], module: str = "") -> None:
-    """Do ``work``, which loads ``what`` of the estimator, and ``say`` (in another thread) that kernels are compiled.
+    """Runs ``work``, which loads ``what`` of the estimator, and reports by ``say`` that kernels are being compiled.
 
-    Nothing is done where an earlier start has left all of them, and nothing said where it has left these. ``module``:
-    imported after that; of what it is missing it compiles under the lock.
+    ``say`` is called in another thread. Nothing runs if an earlier start has compiled everything, and ``say`` is not
+    called if no kernel is missing. ``module``: imported afterwards; its missing kernels are compiled under the lock.
 
     Raises:
         CannotLoad: as for :func:`load`.
@@ -137,7 +137,7 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
 
 
 def _import(module: str) -> None:
-    """Import a module of kernels that no daemon loads."""
+    """Imports a module of kernels that no daemon loads."""
     from estimator import CACHE_DIR
 
     with KernelLock(CACHE_DIR) as lock, before_compiling(lock.acquire):
@@ -146,7 +146,7 @@ def _import(module: str) -> None:
 
 @contextlib.contextmanager
 def _announced(say: Callable[[str], None], before: set[Path]) -> Iterator[None]:
-    """``say`` that kernels are being compiled as soon as the first one is there that was not ``before``."""
+    """Context that calls ``say`` once the first kernel is compiled that was not there ``before``."""
     done = threading.Event()
 
     def look() -> None:
@@ -171,7 +171,7 @@ def _compiled() -> set[Path]:
 
 
 def mark_of(what: str) -> Path:
-    """The file that says that an earlier start has compiled all that this one needs."""
+    """Returns the mark file, which exists once an earlier start has compiled all that this one needs."""
     from estimator import CACHE_DIR
 
     # the directory is named by the sources' content; numba also keys by the path they were loaded from, and by the
@@ -181,26 +181,26 @@ def mark_of(what: str) -> Path:
 
 
 def _processor() -> str:
-    """What Linux says of the first one's make and abilities (proc(5)): more than the compiler goes by."""
+    """Returns type and features of the first processor as Linux lists them (proc(5)): more than the compiler uses."""
     first = CPUINFO.read_text().partition("\n\n")[0]
     return "\n".join(line for line in first.splitlines() if line.partition("\t")[0].partition(":")[0].strip() in MAKE)
 
 
 def is_marked(what: str) -> bool:
-    """Whether that file is there, and kernels: who makes room on a disk deletes these, which are large."""
+    """True if the mark file and kernels exist; a clean-up of the disk may delete the kernels, which are large."""
     return mark_of(what).exists() and bool(_compiled())
 
 
 def _what(lights: bool) -> str:
-    """What a start of the daemon needs, with lights or without."""
+    """Returns the name of the set of kernels for a start of the daemon, with or without lights."""
     return "warm-lights" if lights else "warm"
 
 
 def is_warm(lights: bool) -> bool:
-    """Whether an earlier start has compiled all that one needs, with lights or without; loads none of it.
+    """True if an earlier start has compiled everything, with or without lights; loads none of it.
 
     Raises:
-        CannotLoad: nowhere to keep compiled kernels.
+        CannotLoad: there is no folder for compiled kernels.
     """
     try:
         return is_marked(_what(lights))
@@ -216,7 +216,7 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
         compiled = False
         if not is_marked(what):
             lock.acquire()
-            compiled = not is_marked(what)  # who had the lock may have compiled them all
+            compiled = not is_marked(what)  # the previous holder of the lock may have compiled them all
         cold = compiled
         if cold:
             count = kernel_count(lights is not None)
@@ -226,7 +226,7 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
             )
 
         def missing() -> None:
-            """A kernel is not there, whatever the mark says."""
+            """Takes the lock when a kernel is missing despite the mark."""
             nonlocal compiled
             lock.acquire()
             compiled = True
@@ -241,7 +241,10 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
 
 @contextlib.contextmanager
 def _uncollected(wanted: bool) -> Iterator[None]:
-    """No look for garbage meanwhile: a fifth of what loading takes, which leaves little; compiling leaves much."""
+    """Context without garbage collection: it takes a fifth of the loading time and frees little.
+
+    Compiling leaves much to free.
+    """
     collects = gc.isenabled()
     if wanted:
         gc.disable()
@@ -253,7 +256,7 @@ def _uncollected(wanted: bool) -> Iterator[None]:
 
 
 def kernel_count(lights: bool = False) -> int:
-    """Kernels that the first start compiles, with lights or without; not those that are written into others."""
+    """Number of kernels that the first start compiles, with or without lights; inlined ones do not count."""
     left_out = OFFLINE if lights else OFFLINE + LIGHT
     files = (path for path in ROOM.rglob("*.py"))
     paths = (path for path in files if not {path.stem, path.parent.name} & set(left_out))
@@ -262,7 +265,7 @@ def kernel_count(lights: bool = False) -> int:
 
 
 def _exercise() -> None:
-    """Two steps with a small scan: what is imported or allocated on first use is so before the first real cycle."""
+    """Makes two steps with a small scan, so that first-use imports and allocations precede the first cycle."""
     import numpy as np
 
     from estimator import UNLIMITED, Scan, new_state, step
@@ -276,7 +279,7 @@ def _exercise() -> None:
 
 
 def _exercise_lights(lights: Lights) -> float:
-    """Steps with light in them; returns the microseconds that the search for one code takes on this computer."""
+    """Makes steps with light; returns the cost of the search for one code on this computer, us."""
     import numpy as np
 
     from daemon.maps.initial_state import new_state
@@ -292,7 +295,7 @@ def _exercise_lights(lights: Lights) -> float:
         step(state, [block], UNLIMITED)
     decoder = new_decoder(profile, 0.0)
     decode(decoder, blocks[0])
-    search(decoder, TIMED_CODES)  # the first one makes the spectra of the codes
+    search(decoder, TIMED_CODES)  # the first call makes the spectra of the codes
     best = float("inf")
     for block in blocks[1:]:
         decode(decoder, block)
@@ -303,7 +306,7 @@ def _exercise_lights(lights: Lights) -> float:
 
 
 def _progress_line(seconds: float, lights: bool = False) -> str:
-    """How far compiling has come after ``seconds``, or what is waited for; empty until the compiler is loaded."""
+    """Returns the progress of compiling after ``seconds``, or what it waits for; empty until the compiler is loaded."""
     kernel = sys.modules.get("estimator.numerics.jit_cache")
     directory: Path | None = getattr(kernel, "CACHE_DIR", None)
     if directory is None:
@@ -314,5 +317,5 @@ def _progress_line(seconds: float, lights: bool = False) -> str:
     count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))
     if count == 0:
         return f"still loading the estimator after {seconds:.0f} s"
-    total = kernel_count(lights)  # kernels that only one part of the program loads may have been compiled beside
+    total = kernel_count(lights)  # kernels of other parts of the program may have been compiled too
     return f"compiling: {min(count, total)} of {total} kernels after {seconds:.0f} s"

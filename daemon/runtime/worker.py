@@ -1,7 +1,8 @@
-"""Background work: nogil jobs that must not delay a cycle, and the cycle in which each answer is applied.
+"""Background worker: runs nogil jobs that must not delay a cycle, and applies each job result in a definite cycle.
 
-Three workers behind one interface: a thread for real time; a fixed number of cycles for virtual time; a recorded
-schedule for replay. Answers are applied only where a cycle collects them, so what a run did can be repeated exactly.
+There are three workers with one interface: threads for real time, a fixed number of cycles for virtual time, and a
+recorded schedule for replay. Job results are applied only where a cycle collects them, so that a run can be repeated
+exactly.
 """
 
 from __future__ import annotations
@@ -19,52 +20,52 @@ from estimator import Answer, Job
 log = logging.getLogger(__name__)
 
 ANSWER_CYCLES: Final = 4
-"""Under the virtual clock a job answers after this many cycles."""
+"""Cycles from a job to its result under the virtual clock."""
 
 URGENT: Final = 2
-"""Jobs of this priority or a lower number do not wait for others."""
+"""Jobs with this priority or a lower number do not wait for others."""
 
 SWITCH_S: Final = 5e-4
-"""A thread that runs Python gives way after so long (the interpreter's own 5 ms would be waited for after every kernel
-of a cycle while a job prepares its numbers)."""
+"""Time after which a thread in Python yields, s. With the interpreter's own 5 ms, a cycle waits after each of its
+kernels while a job prepares its data."""
 
 TRIES: Final = 3
 PAUSE_S: Final = 0.2
-"""A job that raises is run so often, in real time with a pause between."""
+"""Pause between the :data:`TRIES` runs of a job that raises, s; in real time only."""
 
 
 _Waiting = queue.PriorityQueue[tuple[int, int, Job | None]]
 
 
 class Worker(Protocol):
-    """Takes jobs at the end of a cycle, gives answers at the start of a later one."""
+    """Accepts jobs at the end of a cycle and returns their results at the start of a later one."""
 
     @property
     def failed(self) -> int:
-        """Jobs that raised each time they were tried; they never answer."""
+        """Jobs that raised in every run; they have no result."""
         ...
 
     def submit(self, jobs: Iterable[Job]) -> None:
-        """Take jobs; returns at once."""
+        """Accepts jobs; returns at once."""
         ...
 
     def collect(self, t_mono: float) -> tuple[Answer, ...]:
-        """Answers that are ready, in the order they were finished, stamped with the cycle's start. Once per cycle."""
+        """Returns finished job results in order of completion, stamped with the cycle's start. Once per cycle."""
         ...
 
     def close(self) -> None:
-        """Drop what waits; idempotent."""
+        """Drops waiting jobs; idempotent."""
         ...
 
 
 class ThreadWorker:
     """Two threads, each with jobs by priority, first come first served within one. Real time only.
 
-    One is for what the pose waits for (settling, solving the graph): a search that runs for long never delays it.
-    Where both work in Python, the cycle gets its turn at the next switch of threads: see :data:`SWITCH_S`.
+    One thread runs the jobs that the pose waits for (finishing submaps, solving the graph). A long search never delays
+    them. If both threads run Python, the cycle continues at the next thread switch: see :data:`SWITCH_S`.
 
     Attributes:
-        since: when each thread began the job that it is at (`time.monotonic`), None while it waits.
+        since: start of each thread's present job (`time.monotonic`, s); None while it waits.
     """
 
     def __init__(self) -> None:
@@ -84,13 +85,13 @@ class ThreadWorker:
             thread.start()
 
     def submit(self, jobs: Iterable[Job]) -> None:
-        """Take jobs; returns at once."""
+        """Accepts jobs; returns at once."""
         for job in jobs:
             self._submitted += 1
             self._waiting[job.priority > URGENT].put((job.priority, self._submitted, job))
 
     def collect(self, t_mono: float) -> tuple[Answer, ...]:
-        """Answers that are ready by now."""
+        """Returns the job results that are finished by now."""
         answers = []
         while not self._done.empty():
             done = self._done.get_nowait()
@@ -101,7 +102,7 @@ class ThreadWorker:
         return tuple(answers)
 
     def close(self) -> None:
-        """Drop what waits and give the running jobs a second; the threads die with the process otherwise."""
+        """Drops waiting jobs and gives running ones a second; the threads otherwise end with the process."""
         self._closed.set()
         for waiting in self._waiting:
             waiting.put((-1, 0, None))
@@ -119,7 +120,7 @@ class ThreadWorker:
 
 
 class CycleWorker:
-    """Virtual time: every job answers a fixed number of cycles after it was submitted, by priority."""
+    """Virtual time: every job has its result a fixed number of cycles after submission, by priority."""
 
     def __init__(self, cycles: int = ANSWER_CYCLES) -> None:
         self.failed = 0
@@ -128,11 +129,11 @@ class CycleWorker:
         self._due: dict[int, list[Job]] = {}
 
     def submit(self, jobs: Iterable[Job]) -> None:
-        """Take jobs; they run when they are due."""
+        """Accepts jobs; they run when they are due."""
         self._due.setdefault(self._cycle + self._cycles, []).extend(jobs)
 
     def collect(self, t_mono: float) -> tuple[Answer, ...]:
-        """Run and answer what is due in this cycle."""
+        """Runs the jobs that are due in this cycle and returns their results."""
         self._cycle += 1
         due = sorted(self._due.pop(self._cycle, ()), key=lambda job: job.priority)
         done = [_run(job) for job in due]
@@ -140,19 +141,19 @@ class CycleWorker:
         return tuple(Answer(t_mono, *item) for item in done if item is not None)
 
     def close(self) -> None:
-        """Drop what waits."""
+        """Drops waiting jobs."""
         self._due.clear()
 
 
 class ScheduledWorker:
-    """Replay of a recording: each answer is applied in the cycle in which it was applied when recorded."""
+    """Replay of a recording: each job result is applied in the cycle in which it was applied when recorded."""
 
     def __init__(
         self, schedule: Mapping[int, tuple[int, ...]], cycle: int = 0, jobs: Mapping[int, Job] | None = None
     ) -> None:
-        """Take the schedule: cycle number, counted from 1, to the job IDs applied in it, in order.
+        """``schedule``: job IDs applied in each cycle, in order, by cycle number from 1.
 
-        ``cycle``: the last one before this, and ``jobs`` by ID that were under way then.
+        ``cycle``: the last one before the start. ``jobs``: pending at that time, by ID.
         """
         self.failed = 0
         self._schedule = schedule
@@ -160,14 +161,14 @@ class ScheduledWorker:
         self._jobs: dict[int, Job] = dict(jobs or {})
 
     def submit(self, jobs: Iterable[Job]) -> None:
-        """Keep jobs until the schedule calls for them; one it never calls for had not answered when recorded."""
+        """Keeps jobs until the schedule needs them; other jobs had no result when recorded."""
         self._jobs.update((job.job_id, job) for job in jobs)
 
     def collect(self, t_mono: float) -> tuple[Answer, ...]:
-        """Run and answer what the schedule says.
+        """Runs the scheduled jobs and returns their results.
 
         Raises:
-            LookupError: the recording applied an answer to a job that this run has not asked for.
+            LookupError: the recording applied the result of a job that this run has not submitted.
         """
         self._cycle += 1
         answers = []
@@ -180,20 +181,20 @@ class ScheduledWorker:
         return tuple(answers)
 
     def close(self) -> None:
-        """Drop what waits."""
+        """Drops waiting jobs."""
         self._jobs.clear()
 
 
 def _run(job: Job, pause_s: float = 0.0) -> tuple[int, object] | None:
-    """Run one job; a defect in it is logged and costs its answer, never the daemon.
+    """Runs one job; a defect in it is logged and loses its result, but never stops the daemon.
 
-    A job changes nothing and can be run again: what fails for want of memory, say, is tried :data:`TRIES` times. The
-    map waits for it, and one without which a submap would never be finished must not be lost to a bad moment.
+    A job changes nothing and can run again. A job that fails, for example for lack of memory, runs up to :data:`TRIES`
+    times. The map waits for it: without its result a submap might never be finished.
     """
     for left in reversed(range(TRIES)):
         try:
             return job.job_id, job.run()
-        except Exception:  # a job is arbitrary work; its failure is counted, published and logged in full
+        except Exception:  # a job may raise anything; its failure is counted, published and logged in full
             log.exception("background job %d failed%s", job.job_id, "; it is tried again" if left else "")
             time.sleep(pause_s if left else 0.0)
     return None

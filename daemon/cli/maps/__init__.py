@@ -1,1 +1,1 @@
-"""The verbs of ``lumiloop map``."""
+"""Bodies of the ``lumiloop map`` verbs: export, render, import, align, name, info and verify."""

@@ -1,4 +1,4 @@
-"""``lumiloop map export|render|import``: a map file as other programs read it, and one made of what they wrote."""
+"""``lumiloop map export|render|import``: converts a map file to other formats, and a map_server map to a map file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from estimator import Identity, image_of_cells
 
 
 def export(args: argparse.Namespace) -> int:
-    """Write what is asked for of a map file; returns the exit code."""
+    """Writes the requested formats of a map file; returns the exit code."""
     try:
         image = image_from(opened(args.log))
         folder = Folder(args.out)
@@ -52,7 +52,7 @@ def export(args: argparse.Namespace) -> int:
 
 
 def render(args: argparse.Namespace) -> int:
-    """Draw a map file as a picture; returns the exit code."""
+    """Writes an image of a map file; returns the exit code."""
     try:
         image = image_from(opened(args.map))
         pixels = draw(grid_of(image), np.zeros((0, 3)), lamps_of(image))
@@ -64,7 +64,7 @@ def render(args: argparse.Namespace) -> int:
 
 
 def take_in(args: argparse.Namespace) -> int:
-    """Make a map file of one of map_server's; returns the exit code."""
+    """Makes a map file of a map_server map; returns the exit code."""
     try:
         described, cells = load(args.yaml)
         named = called(args.name) if args.name else args.yaml.stem[:LONGEST_NAME]

@@ -1,4 +1,4 @@
-"""``lumiloop map align|name``: change a map file."""
+"""``lumiloop map align|name``: moves a map to given points, or sets its name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from daemon.system import console
 
 
 def align(args: argparse.Namespace) -> int:
-    """Move a map so that points of it come to lie where a person says; returns the exit code."""
+    """Moves a map so that its points lie at the given positions; returns the exit code."""
     try:
         stored = opened(args.map)
         if stored.meta.surveyed:
@@ -36,7 +36,7 @@ def align(args: argparse.Namespace) -> int:
 
 
 def name(args: argparse.Namespace) -> int:
-    """Say which floor or building a map is of; returns the exit code."""
+    """Sets the name of the floor or building of a map; returns the exit code."""
     try:
         stored = opened(args.map)
         meta = msgspec.structs.replace(stored.meta, name=called(args.text))

@@ -1,4 +1,4 @@
-"""`lumiloop map export SOURCE --out DIR`: the map of a log or of a map file as other programs read it."""
+"""`lumiloop map export SOURCE --out DIR`: exports the map of a log or of a map file for other programs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from daemon.system import console
 
 
 def main(args: argparse.Namespace) -> int:
-    """The command's body; returns the exit code."""
+    """Runs the command; returns the exit code."""
     if is_map(args.log):
         from daemon.cli.maps import convert
 
@@ -27,7 +27,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def is_map(path: Path) -> bool:
-    """Whether the source is a map file; what cannot be read is left to those who say so."""
+    """True if the source is a map file; errors of an unreadable file are reported by its reader."""
     try:
         with path.open("rb") as file:
             return file.read(len(MAGIC)) == MAGIC

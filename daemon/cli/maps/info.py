@@ -1,4 +1,4 @@
-"""``lumiloop map info FILE`` and ``lumiloop map verify FILE``: what a map file holds, and whether it is good.
+"""``lumiloop map info FILE`` and ``lumiloop map verify FILE``: print the content of a map file, and check it.
 
 Both load neither the estimator nor its compiler.
 """
@@ -19,7 +19,7 @@ from daemon.system import console
 
 
 def info(args: argparse.Namespace) -> int:
-    """The command's body; returns the exit code."""
+    """Runs the command; returns the exit code."""
     stored = _read(args.map)
     if isinstance(stored, str):
         return console.fail(stored)
@@ -29,7 +29,7 @@ def info(args: argparse.Namespace) -> int:
 
 
 def verify(args: argparse.Namespace) -> int:
-    """The command's body; returns the exit code: 1 where one of the files is not good."""
+    """Runs the command; returns the exit code: 1 if one of the files is not good."""
     bad = 0
     for path in args.maps:
         stored = _read(path)
@@ -43,7 +43,7 @@ def verify(args: argparse.Namespace) -> int:
 
 
 def _read(path: Path) -> Stored | str:
-    """What is in a file, or why it cannot be used and what to do."""
+    """Returns the content of a file, or why it cannot be used, with the remedy."""
     try:
         return read(path.read_bytes())
     except OSError as error:
