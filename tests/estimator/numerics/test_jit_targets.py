@@ -26,8 +26,10 @@ WAYS: dict[str, dict[str, str]] = {
 }
 OTHERS = ["indices checked", "generic processor"]
 CHOSEN = (
-    *("distance_region", "linear3", "lines", "scanpoints", "icp", "matchers", "journal"),
-    *("pipeline", "bad_input", "cdma_kernels", "optics"),
+    *("scan_matching/test_distance_region", "numerics/test_symmetric3", "scan_matching/test_line_features"),
+    *("scan_matching/test_deskew", "scan_matching/test_icp", "paper/test_registration"),
+    *("scan_matching/test_match_trace", "test_pipeline", "scan_matching/test_bad_input"),
+    *("cdma/test_correlation_kernels", "light_filter/test_lambertian"),
 )
 """Tests of the kernels of search, match, map, step and light that take seconds."""
 
@@ -73,7 +75,7 @@ def marked(way: str) -> object:
 
 @pytest.mark.parametrize("way", [marked(way) for way in OTHERS])
 def test_the_estimators_tests_pass(way: str) -> None:
-    files = [f"tests/estimator/test_{name}.py" for name in CHOSEN]
+    files = [f"tests/estimator/{name}.py" for name in CHOSEN]
     done = child(way, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow and not system", *files)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
 
