@@ -45,7 +45,7 @@ check: venv  ## formatting, lint, strict types
 	$(BIN)/mypy
 
 QUICK := not slow and not system
-quick: venv  ## the tests of what has changed since main, most specific first (<= 60 s; ARGS=--list only names them)
+quick: venv  ## the tests that directly import what has changed since main (<= 60 s; ARGS=--list only names them)
 	$(RUN) -m tools.ci.quick --marks "$(QUICK)" $(ARGS)
 
 test: venv  ## everything quick (no root, <= 12 minutes)

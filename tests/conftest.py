@@ -25,9 +25,8 @@ settings.load_profile("shared machine")  # how long an example takes there says 
 ROOT = Path(__file__).parents[1]
 UNTRACED = ("estimator", "faults", "fuzz", "hil", "logs", "tools")
 """Folders of storms and drives: they go over the same lines a million times, for which tracing takes two to five times
-as long, and reach hardly one that the other tests do not (`tools.ci.floors` tells). The estimator's are traced in the
-row
-without the compiler."""
+as long, and reach hardly one that the other tests do not (see `tools.ci.floors`). The estimator's are traced in the
+row without the compiler."""
 
 FIRST = (
     "tools/test_soak.py",

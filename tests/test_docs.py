@@ -13,6 +13,7 @@ import pytest
 from daemon.cli.parser import main
 
 ROOT = Path(__file__).parents[1]
+ROOMS = ("daemon", "estimator", "hal", "taps", "tools", "tests", "systemd")
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -59,6 +60,30 @@ def test_every_equation_of_the_paper_leads_to_functions_that_exist() -> None:
     for module, name, file in named:
         assert Path(file).stem == module
         assert re.search(rf"^(def|class) {name}\b", (ROOT / file).read_text(), re.MULTILINE), f"{module}.{name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_named_source_files_exist(page: Path) -> None:
+    files = {path.name for room in ROOMS for path in (ROOT / room).rglob("*.py")}
+    named = set(re.findall(r"`(?:[\w./]*/)?(\w+\.py)`", page.read_text()))
+    assert named <= files, f"{page.name} names {sorted(named - files)}"
+
+
+def test_the_subscription_protocol_is_a_list_of_three_steps() -> None:
+    section = (ROOT / "docs" / "udp.md").read_text().partition("## Subscribing\n")[2].partition("\n## ")[0]
+    assert re.findall(r"^(\d\. \S+ \S+) ", section, re.MULTILINE) == ["1. Send ASK", "2. Send ASK", "3. Ask again"]
+
+
+def test_words_for_the_fuzz_target_are_options_of_pytest() -> None:
+    row, recipe = re.findall(r"^fuzz:.*\n\t.*", (ROOT / "Makefile").read_text(), re.MULTILINE)[0].splitlines()
+    page = re.findall(r"`make fuzz` \([^)]*\)", (ROOT / "docs" / "performance.md").read_text())[0]
+    words = re.findall(r'ARGS="(-\w) (\w+)"', row + page)
+    assert ("-m", "slow") in words
+    (file,) = re.findall(r"tests/\S+\.py", recipe)
+    for option, word in words:
+        command = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-m", "not slow", file, option, word]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, f"{option} {word}: {done.stdout}{done.stderr}"
 
 
 def programs() -> dict[str, list[tuple[str, list[str]]]]:

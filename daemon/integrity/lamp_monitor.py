@@ -65,7 +65,6 @@ class LampWatch:
     faults: frozenset[Fault] = frozenset()
     stalled: int = 0
     odd: dict[int, tuple[Fault, float]] = field(default_factory=dict)
-    _t_epoch: float = float("-inf")
     _lamps: dict[tuple[int, Fault], _Lasting] = field(default_factory=dict)
     _dark: _Lasting = field(default_factory=lambda: _Lasting(LASTS_S))
     _twin: _Lasting = field(default_factory=lambda: _Lasting(TWIN_S))

@@ -77,9 +77,9 @@ With `*:PORT` among `pose.receivers`, a program gets pose datagrams by asking fo
 
 {table(("byte", "type", "meaning"), _subscription_rows())}
 
-1. Send ASK with the lease that is wanted and cookie 0. The answer is COOKIE. 2. Send ASK again with that cookie. The
-answer is GRANTED with the lease in seconds, {udp_subscriptions.LONGEST_LEASE_S} at
-   most, or FULL: there are never more than {udp_subscriptions.SUBSCRIBERS} subscribers. Pose datagrams come to the
+1. Send ASK with the lease that is wanted and cookie 0. The answer is COOKIE.
+2. Send ASK again with that cookie. The answer is GRANTED with the lease in seconds, {udp_subscriptions.LONGEST_LEASE_S}
+   at most, or FULL: there are never more than {udp_subscriptions.SUBSCRIBERS} subscribers. Pose datagrams come to the
    socket that asked, from the port that was asked.
 3. Ask again with the cookie of the last answer before the lease is over, best after a third of it; if the answer is
    COOKIE, repeat with the new one. A lease of 0 ends it.

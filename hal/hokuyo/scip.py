@@ -22,7 +22,6 @@ LINE_PAYLOAD: Final = 64
 ACCEPTED: Final = "00"
 DATA: Final = "99"
 RESUMED: Final = "98"  # streaming again after a self-check
-LASER_ALREADY_ON: Final = "02"  # of BM; a success
 ABNORMAL: Final = "0L"  # SCIP 2.2: only RB and state queries are accepted
 DENIED: Final = frozenset({"0E", "10"})  # refused at present: typical of time-adjust mode
 
@@ -34,7 +33,6 @@ QT: Final = b"QT\n"
 RS: Final = b"RS\n"
 RT: Final = b"RT\n"
 RB: Final = b"RB\n"
-TM_ENTER: Final = b"TM0\n"
 TM_READ: Final = b"TM1\n"
 TM_LEAVE: Final = b"TM2\n"
 TO_SCIP2: Final = b"SCIP2.0\n"

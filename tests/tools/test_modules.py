@@ -1,4 +1,4 @@
-"""Every module of the tools can be imported. Programs are run by the tests of the documents."""
+"""Every module of the tools can be imported. The tests of the documents run the programs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[2]
 MODULES = sorted(path for path in (ROOT / "tools").rglob("*.py") if path.name != "__main__.py")
 
 
-@pytest.mark.parametrize("path", MODULES, ids=str)
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_a_module_can_be_imported(path: Path) -> None:
+    """A module that cannot be imported fails; nothing else is asserted."""
     importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"))

@@ -7,7 +7,7 @@ out, and a trajectory gains nothing from points that it spoils. The mean over al
 is better.
 
 Ours is T_odom_base as it was published: no loop closure, no hindsight. The peer matches every scan with the one before
-by point-to-line ICP on scipy's cKDTree, in full (`_peers.kdtree`, normals from few and from many neighbours: the better
+by point-to-line ICP on scipy's cKDTree, in full (`peers.kdtree`, normals from few and from many neighbours: the better
 one of each log counts), from the wheels' motion where there are wheels, else from its own last motion. Both take each
 beam at its own instant.
 """

@@ -16,12 +16,11 @@ from typing import Final
 
 from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.points import I16, I32, U16, U32, Layout, Point, Rule, Value
-from daemon.snapshot import LISTED_LINKS, LightFix, LinkUse, Snapshot
+from daemon.snapshot import LISTED_LINKS, LightFix, Snapshot
 
 Getter = Callable[[Snapshot], Value]
 
 _FIXES: Final = ", ".join(f"{fix.value} {fix.name}" for fix in LightFix)
-_USES: Final = ", ".join(f"{use.value} {use.name}" for use in LinkUse)
 
 
 def _light(name: str) -> Getter:

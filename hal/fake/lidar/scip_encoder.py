@@ -12,7 +12,6 @@ import numpy.typing as npt
 LINE = 64
 """Payload characters in a data line; a sum character and LF follow."""
 
-MAX_2 = (1 << 12) - 1
 MAX_3 = (1 << 18) - 1
 MAX_4 = (1 << 24) - 1
 

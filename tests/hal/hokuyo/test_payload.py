@@ -94,9 +94,6 @@ def test_frame_lengths_on_the_wire() -> None:
     assert ScanRequest("MD", 44, 725, 3).frame_bytes == 733
 
 
-echo_lists = st.lists(st.integers(0, 262143), min_size=1, max_size=3)
-
-
 @given(st.sampled_from(["MD", "MS", "ME", "ND", "NE", "GD", "GS", "GE", "HD", "HE"]), st.data())
 def test_round_trip(name: str, data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 150), "beams")

@@ -27,7 +27,6 @@ from tools.experiments.support.report import Skipped
 
 Array = npt.NDArray[np.float64]
 
-GRAVITY: Final = 9.81
 STATIC_LAMPS: Final = ((0.26, 0.66, 2.6), (4.61, 0.67, 2.6), (4.57, 4.25, 2.6), (0.18, 4.25, 2.6), (2.45, 2.49, 2.6))
 WALK_LAMPS: Final = (
     (0.351, 1.342, 2.832),

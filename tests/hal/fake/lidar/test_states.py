@@ -12,7 +12,6 @@ from hal.fake.lidar.models import UST_10LX, UTM_30LX, LidarModel, Unit
 from tests.hal.fake.bench import Talk, virtual
 
 UST = replace(UST_10LX, link="usb")  # so that the line can be opened while it starts
-SLOW_START = 100.0
 
 COLUMNS = ("BOOTING", "IDLE", "SINGLE", "MULTI", "TIME_ADJUST", "ERROR", "SLEEP")
 #             BOOTING IDLE  SINGLE MULTI T_ADJ ERROR SLEEP, and the state it ends in where that is another one
