@@ -41,15 +41,8 @@ def go_back(pose: MapPose, motion: Motion, scan: Scan) -> Ahead:
     P = swung(x, y, motion.P - Q_odom)
     known = positive(P)
     both = shared(alignment, motion, scan.t_end, Q_odom) if known else Q_odom
-    ahead = Ahead(
-        motion.t_mono,
-        delta,
-        Q,
-        turned(both, -then[2]),
-        known,
-        motion.velocity.copy(),
-        motion.velocity_variance.copy(),
-    )
+    since = delta, Q, turned(both, -then[2])
+    ahead = Ahead(motion.t_mono, *since, known, motion.velocity.copy(), motion.velocity_variance.copy())
     motion.P = P if known else swung(x, y, motion.P)
     if alignment is not None:
         alignment.P = swung(x, y, alignment.P)
