@@ -104,7 +104,7 @@ class Deadline:
         """``end``: `time.monotonic` at which the budget ends."""
         self.over, self.failed = False, 0
         self.waiting: dict[str, None] = {}
-        self._end = end
+        self._end, self._ended = end, threading.Event()
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -116,13 +116,12 @@ class Deadline:
     def pytest_runtestloop(self, session: pytest.Session) -> Generator[None, object, object]:
         """Interrupt a test that outlasts the budget."""
         self.waiting = dict.fromkeys(item.nodeid for item in session.items)
-        timer = threading.Timer(max(self._end - time.monotonic(), 0.0), self._interrupt)
-        timer.daemon = True
-        timer.start()
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+        threading.Thread(target=self._interrupt, daemon=True).start()
         try:
             return (yield)
         finally:
-            timer.cancel()
+            self._ended.set()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Count failures."""
@@ -136,8 +135,11 @@ class Deadline:
             item.session.shouldstop = "the time is over"
 
     def _interrupt(self) -> None:
-        self.over = True
-        os.kill(os.getpid(), signal.SIGINT)  # a signal also ends a wait for a lock
+        """Interrupt the run once a second from the end of the budget on: a destructor may swallow an interrupt."""
+        wait_s = max(self._end - time.monotonic(), 0.0)
+        while not self._ended.wait(wait_s):
+            self.over, wait_s = True, 1.0
+            os.kill(os.getpid(), signal.SIGINT)  # a signal also ends a wait for a lock
 
 
 def main(words: Sequence[str] | None = None, root: Path = ROOT) -> int:
