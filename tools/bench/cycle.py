@@ -33,7 +33,6 @@ from daemon.runtime.warmup import load
 from estimator import pipeline
 from estimator.cdma import decoder
 from estimator.cdma.air_interface import PROFILE_A
-from estimator.fusion import map_odom_filter
 from estimator.light_filter import light_filter
 from estimator.result import Fix
 from hal.adc import AdcStatus, RawSamples
@@ -172,17 +171,27 @@ async def _run(daemon: Daemon, drive: EndlessDrive, clock: ManualClock, span: tu
     return Outcome(stages, seconds, np.array(links, float), resident, cycle.overruns - overruns, made)
 
 
+STAGE_OF: Final = (
+    (SnapshotBuilder, "build", "judge"),
+    *((decoder, "decode", "decode"), (decoder, "search", "search")),
+    *((light_filter, "update", "lights"), (light_filter, "predict", "lights"), (pipeline, "fuse_light", "lights")),
+    *((pipeline, "virtual_frame", "match"), (pipeline, "match_scan", "match")),
+    *((pipeline, "fuse_match", "fuse"), (pipeline, "predict", "fuse")),
+    *((pipeline, "extends_map", "map"), (pipeline, "extend_map", "map")),
+)
+"""Functions of the estimator by stage: owner, attribute, stage."""
+
+
 def instrument(stages: Stages, daemon: Daemon) -> None:
     """Wrap what the stages are made of."""
     cycle = daemon.cycle
-    for owner, attribute, stage in (
-        (cycle, "_bridge", "bridge"), (cycle, "_step", "step"), (cycle, "_judge", "judge"), (cycle, "_publish",
-        "publish"), (SnapshotBuilder, "build", "judge"), (decoder, "decode", "decode"), (decoder, "search", "search"),
-        (light_filter, "update", "lights"), (light_filter, "predict", "lights"), (map_odom_filter, "on_lights",
-        "lights"), (pipeline, "virtual_frame", "match"), (pipeline, "match_scan", "match"), (pipeline, "fuse", "fuse"),
-        (pipeline, "predict", "fuse"), (pipeline, "keyframe_due", "map"), (pipeline, "lay_keyframe", "map"), (pipeline,
-        "lay_anchor", "map"), (pipeline, "update_map", "map"),
-    ):  # fmt: skip
+    own = (
+        (cycle, "_bridge", "bridge"),
+        (cycle, "_step", "step"),
+        (cycle, "_judge", "judge"),
+        (cycle, "_publish", "publish"),
+    )
+    for owner, attribute, stage in (*own, *STAGE_OF):
         stages.wrap(owner, attribute, stage)
 
 
