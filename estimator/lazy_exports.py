@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 
@@ -24,9 +25,9 @@ def exports_of(
         if name not in module_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, path = module_of[name]
-        if not module:
-            return import_module(f"{package}.{path}")
-        return getattr(import_module(f"{package}.{module}"), name)
+        found = getattr(import_module(f"{package}.{module}"), name) if module else import_module(f"{package}.{path}")
+        vars(sys.modules[package])[name] = found  # the next look-up finds it without this function
+        return found
 
     exported = sorted(module_of)
     return package_getattr, lambda: exported, exported

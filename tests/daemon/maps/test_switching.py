@@ -175,7 +175,7 @@ def test_a_map_that_nothing_can_be_begun_with_is_moved_aside_and_the_one_before_
             raise IndexError("index 7 is out of bounds")
         return restored(image, *more)
 
-    monkeypatch.setattr("estimator.stored_map.restored", raising)
+    monkeypatch.setattr("estimator.restored", raising)
     settings = Config(lidar=LidarConfig(device=DEVICE), modbus=ModbusConfig(port=0), map=MapConfig(folder=str(maps)))
 
     async def go() -> Bench:

@@ -165,7 +165,7 @@ def test_a_start_of_which_one_kernel_is_missing_waits_before_it_compiles_it(tmp_
 def test_a_first_start_waits_for_another_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("estimator.numerics.jit_cache.CACHE_DIR", tmp_path)
+    monkeypatch.setattr("estimator.CACHE_DIR", tmp_path)
     monkeypatch.setattr(warmup, "_exercise", lambda: None)
     caplog.set_level("INFO")
     with ThreadPoolExecutor(1) as pool:
@@ -200,7 +200,7 @@ def test_a_start_loads_nothing_it_does_not_use(lit: bool) -> None:
 
 
 def test_progress_counts_what_was_compiled_since_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("estimator.numerics.jit_cache.CACHE_DIR", tmp_path)
+    monkeypatch.setattr("estimator.CACHE_DIR", tmp_path)
     old = tmp_path / "old.nbc"
     old.touch()
     os.utime(old, (time.time() - 1000.0,) * 2)
@@ -306,7 +306,7 @@ def test_what_a_command_compiles_beyond_the_daemons_kernels_it_compiles_under_th
 ) -> None:
     taken: list[str] = []
     monkeypatch.setattr(warmup, "mark_of", lambda what: tmp_path / what)
-    monkeypatch.setattr("estimator.numerics.jit_cache.CACHE_DIR", tmp_path)
+    monkeypatch.setattr("estimator.CACHE_DIR", tmp_path)
     monkeypatch.setattr(KernelLock, "acquire", lambda lock: taken.append("taken"))
     (tmp_path / "of_its_own.py").write_text("import numba\nnumba.njit('f8(f8)')(lambda x: x + 1.0)\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -339,7 +339,7 @@ def test_a_warm_up_that_an_earlier_start_has_done_loads_nothing() -> None:
 
 def test_a_mark_without_kernels_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who makes room on the disk deletes what is large: the kernels, and not the mark."""
-    monkeypatch.setattr("estimator.numerics.jit_cache.CACHE_DIR", tmp_path)
+    monkeypatch.setattr("estimator.CACHE_DIR", tmp_path)
     monkeypatch.setattr(warmup, "_exercise", lambda: None)
     worked: list[str] = []
     for what in ("warm", "export"):
