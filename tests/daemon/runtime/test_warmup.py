@@ -200,7 +200,7 @@ def test_a_start_loads_nothing_it_does_not_use(lit: bool) -> None:
 
 
 def test_progress_counts_what_was_compiled_since_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("estimator.CACHE_DIR", tmp_path)
+    monkeypatch.setattr("estimator.numerics.jit_cache.CACHE_DIR", tmp_path)
     old = tmp_path / "old.nbc"
     old.touch()
     os.utime(old, (time.time() - 1000.0,) * 2)

@@ -171,7 +171,7 @@ async def test_drawing_that_has_failed_is_tried_again(
         return draw(task)
 
     draw = live_grid.advance
-    monkeypatch.setattr(live_grid, "advance", advance)
+    monkeypatch.setattr("estimator.advance", advance)
     monkeypatch.setattr(maps_tiles, "AGAIN_S", 0.05)
 
     async with running(tmp_path / "stream") as server:
