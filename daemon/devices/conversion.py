@@ -121,49 +121,96 @@ def in_sector(bearing_deg: Array, begin: float, end: float) -> npt.NDArray[np.bo
     return np.asarray((bearing_deg - begin + slack) % 360.0 <= (end - begin) % 360.0 + 2.0 * slack)
 
 
+Reading = tuple[float, Array]
+"""Stamp (s) of cumulative odometry, and its pose (x, y, yaw; m, m, rad)."""
+
+
 class OdometryBridge:
-    """Converts cumulative odometry to increments of the base, and detects a restart of its sender.
+    """Converts cumulative odometry to increments of the base; a wrong reading, or a new origin, is no motion.
 
     Stamps are already on our clock (`RawOdometry.t_mono`); a stamp in the future is limited to the time of arrival.
+    A reading that the velocity and the largest acceleration do not explain from the last good one is held back. Later
+    ones decide: those that the last good one explains show that it was wrong. If none does for :data:`HOLD_S`, the
+    wheels did move so, or the sender has a new origin where no robot is so fast.
+
+    Attributes:
+        jumps: number of new origins. invalid: number of readings that are no numbers.
+        bridged: number of wrong readings.
     """
 
-    FASTEST_M_S: Final = 5.0
-    FASTEST_RAD_S: Final = 10.0
-    """Faster than any indoor robot, rad/s; a motion above this plus the minimum tolerance is a jump of the sender."""
-    FLOOR_M: Final = 0.3
-    FLOOR_RAD: Final = 0.6
+    FASTEST: Final = np.array((5.0, 10.0))
+    """Faster than any indoor robot, m/s and rad/s."""
+    ACCELERATION: Final = np.array((5.0, 6.0))
+    """Largest acceleration of wheels that do not slip, m/s^2 (half of gravity) and rad/s^2."""
+    FLOOR: Final = np.array((0.2, 0.2))
+    """Motion, m and rad, that jitter of stamps explains: 0.1 s of it at 2 m/s, or at 2 rad/s."""
+    JUMP: Final = np.array((0.3, 0.6))
+    """Smallest jump of the sender, m and rad, beyond the fastest motion."""
     LONGEST_S: Final = 2.0
     """Longest interval in s that extends the permitted motion: a restart of the sender after a pause must still be
     detected."""
+    HOLD_S: Final = 0.5
+    """Longest time, s, for which the estimator extrapolates the pose without odometry."""
+    MEAN_S: Final = 0.1
+    """Shortest interval, s, of a velocity: over a shorter one, jitter of stamps dominates."""
 
     def __init__(self) -> None:
         self.jumps = 0
         self.invalid = 0
-        self._last: tuple[float, Array] | None = None
+        self.bridged = 0
+        self._last: Reading | None = None
+        self._held: list[Reading] = []
+        self._since: Reading | None = None
+        self._velocity = np.zeros(3)
 
     def increment(self, raw: RawOdometry) -> Odometry | None:
-        """Motion since the last reading; None for the first reading, and after a jump."""
+        """Motion since the last good reading; None for the first one, after a jump, and while one is held back."""
         if not all(map(math.isfinite, (raw.t_mono, raw.x, raw.y, raw.yaw))):
             self.invalid += 1
             return None
-        pose = np.array((raw.x, raw.y, raw.yaw))
-        t_end = min(raw.t_mono, raw.t_rx)
+        reading = min(raw.t_mono, raw.t_rx), np.array((raw.x, raw.y, raw.yaw))
         if self._last is None:
-            self._last = (t_end, pose)
+            self._last = self._since = reading
             return None
-        t_begin, before = self._last
-        t_end = max(t_begin, t_end)  # stamps may run backwards; the motion is real all the same
-        self._last = (t_end, pose)
-        delta = se2.between(before, pose)
-        if self._jumped(delta, t_end - t_begin):
+        if self._explained(self._last, reading):
+            self.bridged += len(self._held)
+        elif not self._held or reading[0] - self._last[0] < self.HOLD_S:
+            self._held.append(reading)
+            return None
+        elif self._too_fast(self._last, reading):
             self.jumps += 1
-            return None
-        return Odometry(t_begin, t_end, delta)
+            self._last = self._since = self._held[-1]
+            self._velocity = np.zeros(3)
+        return self._accept(self._last, reading)
 
-    def _jumped(self, delta: Array, seconds: float) -> bool:
-        seconds = min(seconds, self.LONGEST_S)
-        too_far = math.hypot(delta[0], delta[1]) > self.FLOOR_M + self.FASTEST_M_S * seconds
-        return too_far or abs(delta[2]) > self.FLOOR_RAD + self.FASTEST_RAD_S * seconds
+    def _accept(self, before: Reading, after: Reading) -> Odometry:
+        t_end = max(before[0], after[0])  # stamps may run backwards; the motion is real all the same
+        self._last, self._held = (t_end, after[1]), []
+        if self._since is not None and t_end - self._since[0] >= self.MEAN_S:
+            moved = se2.between(self._since[1], after[1])
+            self._velocity, self._since = se2.log(moved) / (t_end - self._since[0]), self._last
+        return Odometry(before[0], t_end, se2.between(before[1], after[1]))
+
+    def _explained(self, before: Reading, after: Reading) -> bool:
+        """Whether an acceleration of the robot explains a motion."""
+        seconds = self._seconds(before, after)
+        carried = se2.exp(self._velocity * min(seconds, self.HOLD_S))
+        off = sizes(se2.between(carried, se2.between(before[1], after[1])))
+        reach = np.minimum(self.ACCELERATION * seconds, self.FASTEST) * seconds
+        return bool(np.all(off <= self.FLOOR + reach))
+
+    def _too_fast(self, before: Reading, after: Reading) -> bool:
+        made = sizes(se2.between(before[1], after[1]))
+        return bool(np.any(made > self.JUMP + self.FASTEST * self._seconds(before, after)))
+
+    def _seconds(self, before: Reading, after: Reading) -> float:
+        return min(max(0.0, after[0] - before[0]), self.LONGEST_S)
+
+
+def sizes(moved: Array) -> Array:
+    """Length and angle (m, rad; or per s) of a motion (x, y, yaw)."""
+    x, y, yaw = moved.tolist()
+    return np.array((math.hypot(x, y), abs(yaw)))
 
 
 class ImuBridge:

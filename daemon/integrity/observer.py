@@ -222,7 +222,8 @@ class Observer:
             self._guessed, self._begun = [False] * 3, False
             self._t_shown = [t_mono] * 3
         if result.anew > self._anew:
-            self._guessed, self._begun = [True] * 3, True
+            carried = result.places is not None
+            self._guessed, self._begun = [carried or not self.odometry_ok(t_mono)] * 3, carried
         self._anew = result.anew
         for axis, known in enumerate(match.known):
             if (match.good and known) or self.odometry_ok(t_mono):

@@ -96,7 +96,8 @@ def candidates(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame:
     vaguest = placed_trace(pose)  # upper bound for every submap, so most are excluded without their own covariance
     for submap in graph.of_part(frame.submap):
         settled = submap.settled
-        if settled is None or submap.way_m >= left_before:
+        joined = submap.key >= graph.broken  # by matches, without a gap
+        if settled is None or (joined and submap.way_m >= left_before):
             continue
         x, y, _ = submap.T_map_submap.tolist()  # most of a large map ends here, so it is done by hand
         u, v, _ = settled.witness.T_odom_keyframe.tolist()

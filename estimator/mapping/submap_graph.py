@@ -71,6 +71,7 @@ class SubmapGraph:
         waiting: loops without consensus.
         stale: whether the graph has changed since it was solved.
         cut_at: ID of a keyframe that begins a submap, 0: any.
+        broken: key of the latest submap that no match joins to the one before, 0: none.
         closures: number of loops accepted so far.
         news: the latest, until it is reported.
     """
@@ -91,6 +92,7 @@ class SubmapGraph:
     waiting: list[Waiting] = field(default_factory=list)
     stale: bool = False
     cut_at: int = 0
+    broken: int = 0
     closures: int = 0
     news: Loop | None = None
 
@@ -145,8 +147,9 @@ class SubmapGraph:
     def add(self, frame: Keyframe, P: Array, sigma: float, anew: bool) -> None:
         """Add a keyframe, with its covariance relative to the previous one (odom axes), to the newest submap.
 
-        ``sigma``: range noise. ``anew``: the local map was lost before it. The two keyframes may then lie anywhere
-        relative to each other, so it begins its own submap.
+        ``sigma``: range noise. ``anew``: the local map was lost before it, so it begins its own submap. ``P`` then
+        contains the whole prediction since the last match. Where the robot may have been carried off as well, the graph
+        is detached (`relocalisation.begin`), and the two keyframes may lie anywhere relative to each other.
         """
         newest, T = self.newest, frame.T_odom_keyframe
         x, y, _ = (T - self.T_odom_last).tolist()
@@ -157,7 +160,8 @@ class SubmapGraph:
         self.T_odom_last = T
         cut = newest is not None and self.parts.detached is not None and newest.key < self.parts.detached
         if newest is None or anew or cut or len(self.frames) >= SIZE or frame.key == self.cut_at:
-            self.strayed = self.strayed + ANYWHERE * (anew or cut)
+            self.strayed = self.strayed + ANYWHERE * cut
+            self.broken = newest.key + 1 if newest is not None and anew else self.broken
             self._begin(frame, newest, sigma)
         frame.submap = next(reversed(self.submaps.values()))
         self.frames.append(frame)

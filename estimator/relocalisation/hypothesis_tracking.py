@@ -266,12 +266,16 @@ class Question:
         holds: whether the pose is confirmed in the local map.
         again: whether an earlier search ended at its cap.
         leapt: whether the scene changed.
+        alone: whether the robot had an opportunity to be carried off (`carriage`).
+        share: inlier share in the local map.
     """
 
     jumped: bool
     holds: bool
     again: bool
     leapt: bool = False
+    alone: bool = True
+    share: float = 0.0
 
 
 @dataclass(slots=True, eq=False)
@@ -299,6 +303,7 @@ class Suspicion:
         leap: state of the scene change detection.
         t_leap: instant of a scene change that has not been judged yet.
         leapt: whether the scene has changed.
+        alone: whether the robot had an opportunity to be carried off.
     """
 
     fitted: int = 0
@@ -322,10 +327,11 @@ class Suspicion:
     leap: Leap = field(default_factory=Leap)
     t_leap: float = -math.inf
     leapt: bool = False
+    alone: bool = False
 
     def end(self) -> None:
         """Clear the trigger and abandon the search."""
-        self.leapt = False
+        self.leapt = self.alone = False
         self.fitted, self.jumped, self.odd, self.question, self.again, self.since = 0, False, False, None, False, 0
 
 

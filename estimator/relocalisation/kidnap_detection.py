@@ -34,7 +34,7 @@ from estimator.measurements import Odometry, Scan
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
-from estimator.relocalisation import global_scan_match, relocalisation
+from estimator.relocalisation import carriage, global_scan_match, relocalisation
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, Verdict
 from estimator.relocalisation.hypothesis_tracking import BEHIND, Question
 from estimator.relocalisation.map_reset import forget_map
@@ -51,14 +51,12 @@ ROW: Final = 3
 
 The first that matches may be from two positions, or blurred.
 """
-UNWATCHED_S, MISSED = 0.5, 4.0
-"""Time (s) that suffices to lift the robot and put it down, also in scan periods: a few lost scans are normal."""
 CHANGED: Final = 0.1
 """Decrease of the inlier share that means another view."""
 LEARNING: Final = 0.1
 """Share of the latest match in the usual values: the time between two, and the inlier share."""
 STILL_M, STILL_RAD = 0.005, 0.005
-"""Largest motion of the wheels (m, rad) at rest, over any number of readings: 0.01 m/s for `UNWATCHED_S`."""
+"""Largest motion of the wheels (m, rad) at rest, over any number of readings: 0.01 m/s for `carriage.LIFT_S`."""
 ROLLS_S, RESTED_S = 0.25, 0.5
 """Times (s) after the last motion of the wheels.
 
@@ -140,7 +138,8 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
     jump = odd and all(too_far(T, dt) for T in (match.correction, made))
     doubt.jumped |= jump
     doubt.leapt |= leapt
-    if doubt.fitted or alone or jump or state.matching.failures >= ROW or leapt:
+    doubt.alone |= alone
+    if doubt.fitted or alone or jump or leapt:
         doubt.odd |= odd
         doubt.fitted = max(doubt.fitted + 1, ROW if leapt else 0)
     else:
@@ -210,17 +209,17 @@ def give_up(state: Owners, question: Question) -> None:
     doubt.question, doubt.fitted, doubt.odd = None, max(doubt.fitted, ROW), True
     doubt.jumped, doubt.again = doubt.jumped or question.jumped, question.again
     doubt.leapt |= question.leapt
+    doubt.alone |= question.alone
 
 
 def unwatched(state: Owners) -> bool:
     """Whether the robot was at rest, or without data, for long without a match; another one has arrived now."""
     doubt, now = state.relocalisation.suspicion, state.motion.t_mono
-    usual, since = doubt.period_s, now - state.matching.t_match
-    alone_s = min(since, max(doubt.unwatched_s, now - doubt.t_still))
+    usual, since, alone = doubt.period_s, now - state.matching.t_match, carriage.possible(state)
     doubt.t_still, doubt.moved, doubt.unwatched_s = now, np.zeros(3), 0.0
     if math.isfinite(since):
         doubt.period_s = (1.0 - LEARNING) * usual + LEARNING * min(since, 2.0 * usual) if usual else since
-    return usual > 0.0 and alone_s >= max(UNWATCHED_S, MISSED * usual)
+    return usual > 0.0 and alone
 
 
 def surprising(state: Owners, match: MatchResult) -> bool:
@@ -240,8 +239,8 @@ def look(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> N
     against = local_map.contradicted(state.matching.local_map, frame.T_odom_lidar, frame.beams(), noise_m)
     share = match.inliers / max(1, match.queries)
     holds = global_scan_match.judged(match, share, against, told) is Verdict.HOLDS
-    asked = Question(doubt.jumped, holds, doubt.again, doubt.leapt)
-    doubt.fitted, doubt.jumped, doubt.odd, doubt.again, doubt.leapt = 0, False, False, False, False
+    asked = Question(doubt.jumped, holds, doubt.again, doubt.leapt, doubt.alone, share)
+    doubt.fitted, doubt.jumped, doubt.odd, doubt.again, doubt.leapt, doubt.alone = 0, False, False, False, False, False
     doubt.since = doubt.since or state.map.next_key
     older = [one for one in graph.settled() if one.first < doubt.since]
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in older if one.settled is not None)
@@ -269,20 +268,35 @@ def answered(state: Owners, asked: Question, payload: object) -> None:
     if doubt.question is not asked:
         return  # light gives the pose, relocalisation runs, or the map has restarted since
     doubt.question = None
-    here = payload.guesses[0]
-    least = max(global_scan_match.LEAST, here.share - BEHIND)
-    if asked.leapt:  # any pose that is not excluded counts, if its own is; in a corridor no match is confirmed
-        least = 0.0 if here.verdict is Verdict.NO else here.share - BEHIND
-    alone = all(fit.share < least for fit, _ in payload.fresh)
-    holds = asked.holds or not asked.jumped or here.verdict is Verdict.HOLDS
-    if not (alone and holds):
+    if elsewhere(asked, payload):
         carried_off(state)
-    elif payload.complete:
-        doubt.since = state.map.graph.cut_at = 0
-    elif asked.jumped or asked.again:
-        carried_off(state)
+    elif payload.complete or not asked.alone or asked.again:
+        doubt.since = state.map.graph.cut_at = 0  # a search that was cut off is no evidence
     else:
-        doubt.fitted, doubt.odd, doubt.again, doubt.leapt = ROW, True, True, doubt.leapt or asked.leapt
+        doubt.fitted, doubt.odd, doubt.again, doubt.leapt, doubt.alone = (
+            ROW,
+            True,
+            True,
+            doubt.leapt or asked.leapt,
+            True,
+        )
+
+
+def elsewhere(asked: Question, looked: Looked) -> bool:
+    """Whether the search shows that the robot is at another place, given its opportunity to be carried there.
+
+    With an opportunity, a place that fits nearly as well is as probable as the own one. So is a place that was jumped
+    to and that nothing confirms. Without one, the prior odds ask for all of the evidence: the map excludes the own
+    place, the local map does not confirm it, and another place fits as a loop does.
+    """
+    here = looked.guesses[0]
+    excluded = here.verdict is Verdict.NO
+    if not asked.alone:
+        return excluded and not asked.holds and any(fit.verdict is Verdict.HOLDS for fit, _ in looked.fresh)
+    own = here.share if excluded else max(here.share, asked.share)
+    least = 0.0 if asked.leapt and excluded else max(global_scan_match.LEAST, own - BEHIND)
+    rivals = any(fit.share >= least for fit, _ in looked.fresh)
+    return rivals or (asked.jumped and not asked.holds and here.verdict is not Verdict.HOLDS)
 
 
 def carried_off(state: Owners) -> None:

@@ -20,6 +20,7 @@ from estimator.mapping import live_grid
 from estimator.mapping.keyframe import Keyframe, Submap
 from estimator.mapping.map_frame import relist, unlist
 from estimator.numerics import se2
+from estimator.relocalisation import carriage
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, look
 from estimator.relocalisation.hypothesis_tracking import Hypothesis, SearchedAside, Seek
 from estimator.relocalisation.landing import SURPRISE, land
@@ -86,11 +87,15 @@ def leave_map(state: Owners) -> None:
 
 
 def local_map_lost(state: Owners) -> None:
-    """Start relocalisation after a local map restart, unless current light confirms the pose.
+    """Start relocalisation after a local map restart, unless the robot was watched or current light confirms the pose.
 
-    A light filter biased by odometry confirms it too, as long as the received lamps are possible here. A robot under
-    relocalisation may have been carried on; the search so far is then void.
+    Wheels that roll, or the last speed for a moment, carry the pose of a robot whose view is blocked. A robot cannot be
+    lifted meanwhile (`carriage.unwatched_s`).
+    A light filter biased by odometry confirms the pose too, as long as the received lamps are possible here. A robot
+    under relocalisation may have been carried on; the search so far is then void.
     """
+    if state.map.parts.detached is None and not carriage.possible(state):
+        return
     alignment = state.pose.alignment
     held = False
     if alignment is not None and light_holds(state.pose, state.motion, state.light) and alignment.gap is not None:
