@@ -139,9 +139,13 @@ def _say_of_light(memory: Memory, evidence: Evidence, light: Light) -> tuple[Sta
 
 
 def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
-    """Part of the table for a pose from the lidar: lost, degraded, unconfirmed or good."""
+    """Part of the table for a pose from the lidar: lost, degraded, unconfirmed or good.
+
+    Wheels carry a pose that no scan confirms: it is vague, and its protection level says how much, but it is not lost.
+    """
     if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
-        return _say_vague(evidence.light)
+        state, reason = _say_vague(evidence.light)
+        return (State.DEGRADED, reason) if evidence.odometry and state is State.LOST else (state, reason)
     if evidence.light is not None and evidence.light.lost:
         return State.RELOCATING if memory.failed else State.DEGRADED, Reason.LIGHT_LOST
     if memory.failed >= FAILED_SCANS:

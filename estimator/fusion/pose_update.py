@@ -41,7 +41,7 @@ def fuse(pose: MapPose, motion: Motion, matching: MatchMemory, match: MatchResul
         matching.failures, matching.t_match = 0, motion.t_mono
         learn_noise(matching, match)
         T_pred, P_pred = motion.T_odom_base, motion.P
-        motion.T_odom_base = match.T_odom_base
+        motion.T_odom_base = matching.T_odom_match = match.T_odom_base
         lacked = motion_model.learn(motion, match.correction, match.information, bool(match.known_axes.all()))
         motion.P = updated(P_pred + lacked, match.information, motion.odometry)
         map_odom_filter.on_match(pose, motion, matching.t_scan, (T_pred, P_pred), lacked)

@@ -31,6 +31,12 @@ PATIENCE = 3
 PATIENCE_S = 1.0
 """With odometry that takes at least so long, s: odometry bridges it, and people before the lidar step away again."""
 
+BLOCKED_M, BLOCKED_RAD = 2.0, 1.05
+"""With odometry, motion (m, rad) since the latest match after which another part of a room is seen.
+
+Until then a blocked view is more probable than a new one.
+"""
+
 NEAR = 0.4
 """Smallest distance of keyframes, in steps: a robot at rest that trembles creates none."""
 
@@ -73,7 +79,12 @@ def lost(motion: Motion, matching: MatchMemory) -> bool:
     if matching.local_map is None:
         return True
     waited = motion.t_mono - matching.t_match
-    return matching.failures >= PATIENCE and (not motion.odometry or waited >= PATIENCE_S)
+    if not motion.odometry:
+        return matching.failures >= PATIENCE
+    x, y, yaw = se2.between(matching.T_odom_match, motion.T_odom_base).tolist()
+    gone = math.hypot(x, y) > BLOCKED_M or abs(yaw) > BLOCKED_RAD
+    at_rest = motion.t_mono - motion.t_stood >= PATIENCE_S
+    return matching.failures >= PATIENCE and waited >= PATIENCE_S and (gone or at_rest)
 
 
 def away(map_: MapState, pose: MapPose, motion: Motion) -> float:

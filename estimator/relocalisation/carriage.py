@@ -19,6 +19,12 @@ def unwatched_s(state: Owners) -> float:
     return min(now - state.matching.t_match, max(doubt.unwatched_s, now - doubt.t_still))
 
 
+def open_question(state: Owners) -> bool:
+    """Whether the robot may have been carried off since the last match, or before matches that have not refuted it."""
+    doubt = state.relocalisation.suspicion
+    return possible(state) or doubt.alone or (doubt.question is not None and doubt.question.alone)
+
+
 def possible(state: Owners) -> bool:
     """Whether the robot may have been carried off since the last match."""
     usual = state.relocalisation.suspicion.period_s

@@ -54,6 +54,9 @@ MOVED_M, MOVED_RAD = 1.0, 0.5
 AGAIN_M, AGAIN_RAD = 1.0, 1.0
 """Path length (m) or rotation (rad) between two searches of the map."""
 
+WORK_PER_S, SAVED_S = 1e5, 10.0
+"""Nodes of searches per second: 5 % of a core (`global_scan_match.FIT_NODES`); and the time (s) of their mean."""
+
 SOONER: Final = 0.45
 """Factor on these while no pose, or too many, have been found."""
 
@@ -118,6 +121,7 @@ class Seek:
         around: light's windows in it.
         t_begin: instant of the first keyframe.
         way_begin: path length when light was first valid, m.
+        t_paid: instant up to which the searches so far have used their share of the computer, s.
         remembered: T_map_odom of the stored pose, if the robot has not been moved since; None: not available.
     """
 
@@ -133,6 +137,11 @@ class Seek:
     t_begin: float = math.inf
     way_begin: float = math.inf
     remembered: Array | None = None
+    t_paid: float = -math.inf
+
+    def pay(self, t_mono: float, work: float) -> None:
+        """Charge the work of a search, in nodes, that ended at ``t_mono``."""
+        self.t_paid = max(self.t_paid, t_mono - SAVED_S) + work / WORK_PER_S
 
     def due(self, frame: Keyframe) -> bool:
         """Whether a keyframe needs a search of the map, beyond tests of the hypotheses."""

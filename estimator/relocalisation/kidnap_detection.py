@@ -145,7 +145,7 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
     else:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
     if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt) and share > doubt.share - CHANGED:
-        doubt.fitted = 0  # the same view from the same position
+        doubt.fitted, doubt.alone = 0, False  # the same view from the same position
     if doubt.question is not None and state.motion.t_mono - doubt.t_asked > GIVEN_UP_S:
         give_up(state, doubt.question)
     return doubt.fitted >= ROW and doubt.question is None
@@ -183,6 +183,16 @@ def looked_through(state: Owners, scan: Scan, points: ScanPoints, match: MatchRe
     eye = se2.compose(match.T_odom_base, scan.T_base_lidar)
     beams = (unturned(scan.bearing_rad, points.turned_rad), scan.range_m, scan.beam)
     return local_map.looked_through(state.matching.local_map, eye, beams, noise_of(state.matching, scan))
+
+
+def blocked(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
+    """Whether objects before the map explain a scan that does not match, of a robot whose wheels are at rest.
+
+    People hide walls, and no beam passes through a wall for them. Where the robot was carried off, beams do.
+    """
+    if not state.motion.t_mono - state.relocalisation.suspicion.t_rest >= ROLLS_S:
+        return False
+    return 0.0 <= looked_through(state, scan, points, match) <= global_scan_match.POSSIBLE
 
 
 def leaps(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult, strange: bool) -> bool:

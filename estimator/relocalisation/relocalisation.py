@@ -22,7 +22,7 @@ from estimator.mapping.map_frame import relist, unlist
 from estimator.numerics import se2
 from estimator.relocalisation import carriage
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, look
-from estimator.relocalisation.hypothesis_tracking import Hypothesis, SearchedAside, Seek
+from estimator.relocalisation.hypothesis_tracking import Hypothesis, SearchedAside, Seek, near
 from estimator.relocalisation.landing import SURPRISE, land
 from estimator.relocalisation.owners import Owners
 from estimator.result import Fix
@@ -55,8 +55,10 @@ YOUNG: Final = 2
 """Fewest keyframes of a map that can be searched."""
 
 
-def begin(state: Owners) -> bool:
+def begin(state: Owners, held: bool = False) -> bool:
     """Detach the map and start relocalisation; False where there is no map to search.
+
+    ``held``: wheels hold the pose meanwhile, see `RelocalisationMemory.held`.
 
     One unfinished submap suffices: the robot begins another one, and the former is then finished. So do submaps that
     are just being finished.
@@ -72,7 +74,7 @@ def begin(state: Owners) -> bool:
     state.relocalisation.suspicion.end()
     state.relocalisation.suspicion.leap.forget()
     graph.detach(state.map.next_key)
-    state.relocalisation.search = Seek()
+    state.relocalisation.search, state.relocalisation.held = Seek(), held
     aside = graph.parts.aside
     if isinstance(aside, SearchedAside):
         aside.search = Seek()
@@ -90,11 +92,11 @@ def local_map_lost(state: Owners) -> None:
     """Start relocalisation after a local map restart, unless the robot was watched or current light confirms the pose.
 
     Wheels that roll, or the last speed for a moment, carry the pose of a robot whose view is blocked. A robot cannot be
-    lifted meanwhile (`carriage.unwatched_s`).
+    lifted meanwhile (`carriage`).
     A light filter biased by odometry confirms the pose too, as long as the received lamps are possible here. A robot
     under relocalisation may have been carried on; the search so far is then void.
     """
-    if state.map.parts.detached is None and not carriage.possible(state):
+    if not carriage.open_question(state):
         return
     alignment = state.pose.alignment
     held = False
@@ -104,7 +106,7 @@ def local_map_lost(state: Owners) -> None:
         here = state.pose.here(state.motion.T_odom_base)
         held = alignment.gap <= SURPRISE or (alignment.proved and in_place(state.light, here))
     if not held or state.map.parts.detached is not None:
-        begin(state)
+        begin(state, held=state.motion.odometry and (state.relocalisation.held or state.map.parts.detached is None))
 
 
 def forget_detached(state: Owners) -> None:
@@ -131,7 +133,7 @@ def disown(state: Owners, first: int, since: int) -> None:
 
 def places(state: Owners) -> int | None:
     """Number of hypotheses, None where the pose is known (see `StepResult.places`); light alone may know it too."""
-    if state.map.parts.detached is None:
+    if state.map.parts.detached is None or holds(state):
         return None
     lit = light_holds(state.pose, state.motion, state.light) and blind(state.pose, state.motion)
     if lit:
@@ -139,6 +141,19 @@ def places(state: Owners) -> int | None:
 
         lit = not disputed(state.light, state.map.graph)
     return None if lit else len(state.relocalisation.search.alive)
+
+
+def holds(state: Owners) -> bool:
+    """Whether wheels hold the pose of a detached part, and no search has confirmed another place.
+
+    A view that is blocked is far more probable than a robot that was carried off, until something shows the latter.
+    """
+    if not state.relocalisation.held or state.map.parts.detached is None:
+        return False
+    T = state.motion.T_odom_base
+    here = state.pose.here(T)
+    confirmed = [one for one in state.relocalisation.search.alive if one.held]
+    return all(near(here, se2.compose(one.T_map_odom, T)) for one in confirmed)
 
 
 def hinted(state: Owners) -> None:
@@ -152,7 +167,7 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
     if graph.parts.detached is None or told is None or graph.jobs.busy(state.relocalisation.search):
         return
     around = windows(state, frame)
-    if around is None and light_is_coming(state):
+    if around is None and (light_is_coming(state) or state.motion.t_mono < state.relocalisation.search.t_paid):
         return
     look_for(state, frame, around)
 
@@ -319,6 +334,7 @@ def take_look(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesi
     if state.relocalisation.search is not seek or state.map.parts.detached is None:
         return
     seek.take(frame, asked, payload)
+    seek.pay(state.motion.t_mono, payload.work())
     if seek.hint is not None and not seek.alive:
         T_map_odom, looks = seek.hint
         seek.hint = (T_map_odom, looks + 1) if looks + 1 < HINT_LOOKS else None

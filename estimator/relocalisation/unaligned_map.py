@@ -88,7 +88,7 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
     aside = parts.aside
     if not isinstance(aside, SearchedAside) or parts.detached is not None or parts.trial is not None:
         return
-    if graph.jobs.busy(aside.search):
+    if graph.jobs.busy(aside.search) or state.motion.t_mono < aside.search.t_paid:
         return
     holds = any(one.held and not one.idle for one in aside.search.alive)
     if graph.way_m - aside.begun_m > enough(state.map.settings.keyframe_m, aside) and not holds:
@@ -110,6 +110,7 @@ def take(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ..
     if not isinstance(aside, SearchedAside) or aside.search is not seek or state.map.parts.detached is not None:
         return
     seek.take(frame, asked, payload)
+    seek.pay(state.motion.t_mono, payload.work())
     one = seek.favourite()
     if one is not None and seek.sure(one, False):
         found(state, aside, one)

@@ -19,7 +19,7 @@ class MatchMemory:
     Attributes:
         local_map: map for the next scan, None before the first keyframe.
         t_scan, T_odom_scan: instant (s) and pose of the latest scan.
-        t_match: instant of the latest scan that matched, s.
+        t_match, T_odom_match: instant (s) and pose of the latest scan that matched.
         t_newest_scan: end of the latest scan, s.
         bearing_rad: the latest bearings that passed validation.
         scans_since_keyframe: scans since the newest keyframe.
@@ -36,6 +36,7 @@ class MatchMemory:
     t_scan: float = -math.inf
     T_odom_scan: Array = field(default_factory=se2.identity)
     t_match: float = -math.inf
+    T_odom_match: Array = field(default_factory=se2.identity)
     t_newest_scan: float = -math.inf
     bearing_rad: Array | None = None
     scans_since_keyframe: int = 0

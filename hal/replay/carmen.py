@@ -119,6 +119,7 @@ def read_carmen(path: Path) -> CarmenLog:
     lasers = _usable(parsed.lasers, report)
     if not lasers:
         raise DataInvalid(str(path), "holds no usable laser line", _first_reasons(report))
+    lasers = _ordered(lasers, report)
     stamps = np.array([line.stamp for line in lasers])
     origin = float(stamps[0])
     clock = monotone(stamps, origin)
@@ -197,6 +198,30 @@ def _usable(lasers: list[LaserLine], report: LogReport) -> list[LaserLine]:
     if used and not beam_geometry(used[0].setup)[2]:
         report.notes.append(f"the log does not say where its {usual} beams point: 180 deg from -90 deg is assumed")
     return used
+
+
+def _ordered(lasers: list[LaserLine], report: LogReport) -> list[LaserLine]:
+    """The scans in the order in which they were taken: that of the file, or that of their stamps.
+
+    Where stamps run backwards, one of the two is wrong. The wheels decide: in the wrong order the robot drives to and
+    fro, so its path is longer.
+    """
+    stamps = np.array([line.stamp for line in lasers])
+    order = np.argsort(stamps, kind="stable")
+    moved = np.flatnonzero(order != np.arange(len(order)))
+    if not len(moved) or any(line.robot is None for line in lasers):
+        return lasers
+    poses = np.array([line.robot for line in lasers])
+    if not _path(poses[order]) < _path(poses):
+        return lasers
+    report.notes.append(f"{len(moved)} scans are out of order: put in the order of their stamps, which the wheels fit")
+    return [lasers[k] for k in order.tolist()]
+
+
+def _path(poses: Array) -> float:
+    """Length of a path plus its rotation, m + rad."""
+    dx, dy, dyaw = np.diff(poses, axis=0).T
+    return float(np.sum(np.hypot(dx, dy) + np.abs((dyaw + np.pi) % (2.0 * np.pi) - np.pi)))
 
 
 def _note_stamps(clock: Monotone, report: LogReport) -> None:

@@ -2,7 +2,8 @@
 
 Two defects are distinguished. *Scatter*: small backward steps, because several processes or a later reconstruction
 wrote the stamps. The file order is right and the stamps are noisy; the time is the least-squares increasing sequence
-(isotonic regression). *A restarted clock*: a step too large for scatter. The following stamps are shifted so that they
+(isotonic regression). *A restarted clock*: a step that is too large for scatter, or
+that lasts. The following stamps are shifted so that they
 continue the log. The records keep their original stamps.
 """
 
@@ -18,6 +19,9 @@ Array = npt.NDArray[np.float64]
 
 BACK_S: Final = 5.0
 """A step back by more than this is a restarted clock, not scatter (real logs scatter by up to about a second)."""
+
+LASTS: Final = 8
+"""Stamps in a row, before and after a smaller step back, that are displaced by it if a clock was set."""
 
 AHEAD_S: Final = 3600.0
 """A forward step by more than this is a clock that was set."""
@@ -49,7 +53,7 @@ def monotone(stamps: Array, origin: float) -> Monotone:
     Equal to ``stamps - origin`` wherever the stamps already increase by at least :data:`GAP_S` undisturbed.
     """
     steps = np.diff(stamps)
-    restart = (steps < -BACK_S) | (steps > AHEAD_S)
+    restart = (steps < -BACK_S) | (steps > AHEAD_S) | _set_back(stamps)
     bridged, restarts = _bridge(stamps - origin, restart)
     back = steps[(steps < 0.0) & ~restart]
     return Monotone(
@@ -59,6 +63,20 @@ def monotone(stamps: Array, origin: float) -> Monotone:
         duplicates=int(np.count_nonzero(steps == 0.0)),
         restarts=restarts,
     )
+
+
+def _set_back(stamps: Array) -> npt.NDArray[np.bool_]:
+    """Steps back that last: :data:`LASTS` stamps before and after the step overlap, each side in order.
+
+    Scatter displaces a few stamps; a clock that was set displaces all that follow.
+    """
+    steps = np.diff(stamps)
+    found = np.zeros(len(steps), np.bool_)
+    for k in np.flatnonzero(steps < 0.0):
+        before, after = stamps[max(0, k + 1 - LASTS) : k + 1], stamps[k + 1 : k + 1 + LASTS]
+        if len(before) == len(after) == LASTS and before[0] > after[-1]:
+            found[k] = bool(np.all(np.diff(before) >= 0.0) and np.all(np.diff(after) >= 0.0))
+    return found
 
 
 def _bridge(stamps: Array, restart: npt.NDArray[np.bool_]) -> tuple[Array, int]:
