@@ -113,6 +113,11 @@ def turned(moved: Array, most_m: float = STILL_M, most_rad: float = STILL_RAD) -
     return math.hypot(x, y) > most_m or abs(yaw) > most_rad
 
 
+def rests(state: Owners) -> bool:
+    """Whether the wheels have not moved for a moment, or tell nothing."""
+    return state.motion.t_mono - state.relocalisation.suspicion.t_rest >= ROLLS_S or not state.motion.odometry
+
+
 def waits(state: Owners) -> bool:
     """Whether no keyframe may be created now, because the robot may be elsewhere."""
     doubt = state.relocalisation.suspicion
@@ -138,7 +143,7 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
     jump = odd and all(too_far(T, dt) for T in (match.correction, made))
     doubt.jumped |= jump
     doubt.leapt |= leapt
-    doubt.alone |= alone
+    doubt.alone |= alone or jump or (leapt and rests(state))
     if doubt.fitted or alone or jump or leapt:
         doubt.odd |= odd
         doubt.fitted = max(doubt.fitted + 1, ROW if leapt else 0)
@@ -280,8 +285,10 @@ def answered(state: Owners, asked: Question, payload: object) -> None:
     doubt.question = None
     if elsewhere(asked, payload):
         carried_off(state)
-    elif payload.complete or not asked.alone or asked.again:
-        doubt.since = state.map.graph.cut_at = 0  # a search that was cut off is no evidence
+    elif payload.complete or not asked.alone:
+        doubt.since = state.map.graph.cut_at = 0
+    elif asked.again:  # a search that was cut off is no evidence: the place is neither given up nor confirmed
+        carried_off(state, held=state.motion.odometry)
     else:
         doubt.fitted, doubt.odd, doubt.again, doubt.leapt, doubt.alone = (
             ROW,
@@ -309,12 +316,15 @@ def elsewhere(asked: Question, looked: Looked) -> bool:
     return rivals or (asked.jumped and not asked.holds and here.verdict is not Verdict.HOLDS)
 
 
-def carried_off(state: Owners) -> None:
-    """Start relocalisation in the whole map; a map of one scan, which cannot be searched, is cleared."""
+def carried_off(state: Owners, held: bool = False) -> None:
+    """Start relocalisation in the whole map; a map of one scan, which cannot be searched, is cleared.
+
+    ``held``: see `relocalisation.begin`.
+    """
     graph, since = state.map.graph, state.relocalisation.suspicion.since
     first = next((one.key for one in graph.submaps.values() if one.first >= since > 0), None)
     if first is not None:
         relocalisation.disown(state, first, since)
-    if not relocalisation.afresh(state) and graph.parts.detached is None:
+    if not relocalisation.afresh(state, held) and graph.parts.detached is None:
         forget_map(state)
         state.matching.restarts += 1

@@ -291,9 +291,9 @@ def doubt(state: Owners) -> None:
         alignment.elsewhere_since, alignment.aside_since, alignment.broken = None, None, True
 
 
-def afresh(state: Owners) -> bool:
-    """Detach the map from the next scan on, with a new local map."""
-    if not begin(state):
+def afresh(state: Owners, held: bool = False) -> bool:
+    """Detach the map from the next scan on, with a new local map; ``held``: see :func:`begin`."""
+    if not begin(state, held):
         return False
     state.matching.local_map, state.matching.failures = None, 0
     return True

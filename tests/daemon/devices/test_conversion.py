@@ -142,31 +142,60 @@ def test_increments_add_up_to_the_whole_motion(
     bridge, pose = OdometryBridge(), np.array(start)
     bridge.increment(RawOdometry(0.0, 0.0, *pose.tolist()))
     total = se2.identity()
-    for number, move in enumerate(moves, 1):
+    for number, move in enumerate([*moves, *[(0.0, 0.0, 0.0)] * 8], 1):  # it rests at the end, and nothing is held back
         pose = se2.compose(pose, np.array(move))
         increment = bridge.increment(RawOdometry(number * 0.1, number * 0.1, *pose.tolist()))
-        assert increment is not None
-        total = se2.compose(total, increment.delta)
+        total = total if increment is None else se2.compose(total, increment.delta)
+    assert not bridge.jumps
     expected = se2.between(np.array(start), pose)
     np.testing.assert_allclose(total[:2], expected[:2], atol=1e-9)
     assert math.isclose(math.cos(total[2] - expected[2]), 1.0, abs_tol=1e-9)
 
 
 def test_a_jump_is_no_motion_and_is_counted() -> None:
+    """The sender has begun anew; the readings before that is certain are no motion either."""
     bridge = OdometryBridge()
     bridge.increment(reading(0.0, 100.0))
-    assert bridge.increment(reading(0.02, 0.0)) is None
+    said = [bridge.increment(reading(0.1 * k, 0.01 * k)) for k in range(1, 10)]
     assert bridge.jumps == 1
-    after = bridge.increment(reading(0.04, 0.01))
-    assert after is not None
-    np.testing.assert_allclose(after.delta, [0.01, 0, 0])
+    moved = [increment.delta for increment in said if increment is not None]
+    assert len(moved) == 5
+    np.testing.assert_allclose(moved, [[0.01, 0.0, 0.0]] * 5, atol=1e-12)
 
 
 def test_a_restart_after_a_long_pause_is_still_a_jump() -> None:
     bridge = OdometryBridge()
     bridge.increment(reading(0.0, 100.0))
     assert bridge.increment(reading(600.0, 0.0)) is None
+    after = bridge.increment(reading(600.1, 0.01))
     assert bridge.jumps == 1
+    assert after is not None
+    np.testing.assert_allclose(after.delta, [0.01, 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("wrong", [(0.5, 0.0, 2.9), (0.0, 0.0, 0.52), (1.5, 0.0, 0.0), (90.0, -3.0, 1.0)])
+@pytest.mark.parametrize("readings", [1, 2])
+def test_a_wrong_reading_is_bridged_from_the_last_good_one(wrong: tuple[float, float, float], readings: int) -> None:
+    """An encoder spike, a gyro glitch: the readings before and after it explain each other."""
+    bridge = OdometryBridge()
+    total = se2.identity()
+    for k in range(20):
+        pose = np.array((0.05 * k, 0.0, 0.0))
+        if 10 <= k < 10 + readings:
+            pose = se2.compose(pose, np.array(wrong))
+        increment = bridge.increment(RawOdometry(0.1 * k, 0.1 * k, *pose.tolist()))
+        total = total if increment is None else se2.compose(total, increment.delta)
+    np.testing.assert_allclose(total, [0.95, 0.0, 0.0], atol=1e-12)
+    assert (bridge.bridged, bridge.jumps) == (readings, 0)
+
+
+def test_wheels_that_spin_are_followed() -> None:
+    """No acceleration of a robot explains it, but reading after reading says so."""
+    bridge, total = OdometryBridge(), se2.identity()
+    for k in range(30):
+        increment = bridge.increment(reading(0.1 * k, 0.0, yaw=0.9 * max(0, min(k, 20) - 10)))
+        total = total if increment is None else se2.compose(total, increment.delta)
+    assert math.cos(total[2] - 9.0) == pytest.approx(1.0)
 
 
 def test_what_moved_while_datagrams_were_lost_is_not_lost() -> None:

@@ -145,19 +145,19 @@ def test_a_loop_closure_tells_the_place() -> None:
 
 
 def test_a_map_begun_anew_is_a_guess_whatever_fits_it() -> None:
-    """Nothing fitted, so a new map was begun: with wheels or without, only something else can say where it lies."""
+    """The robot may have been carried off before: wheels hold the pose, and only a search can confirm it."""
     watch = Watch(odometry=True)
     assert not watch.see(step(match())).guessed
-    begun = watch.see(replace(step(match()), anew=1))
+    begun = watch.see(replace(step(match()), anew=1, held=True))
     assert begun.guessed
     assert begun.match is not None
     assert begun.match.known == (False, False, False)
-    later = watch.see(replace(step(match()), anew=1))
+    later = watch.see(replace(step(match()), anew=1, held=True))
     assert later.guessed
-    ordered = watch.see(replace(step(match()), anew=1), Command(0.0, Order.SET_POSE, np.zeros(3)))
+    ordered = watch.see(replace(step(match()), anew=1, held=True), Command(0.0, Order.SET_POSE, np.zeros(3)))
     assert not ordered.guessed
-    assert not watch.see(replace(step(match()), anew=1)).guessed
-    assert watch.see(replace(step(match()), anew=2)).guessed, "and begun once more"
+    assert not watch.see(replace(step(match()), anew=1, held=True)).guessed
+    assert watch.see(replace(step(match()), anew=2, held=True)).guessed, "and begun once more"
 
 
 @pytest.mark.parametrize(("reason", "tells"), [(why, why.name in ("PLACED", "LIT")) for why in LoopReason])
@@ -165,8 +165,18 @@ def test_after_a_map_was_begun_anew_only_a_search_everywhere_tells_the_place(rea
     """A robot that was carried off to where it looks alike closes loops there as it would at the right place."""
     watch = Watch(odometry=True)
     watch.see(step(match()))
-    watch.see(replace(step(match()), anew=1))
-    assert watch.see(replace(step(match()), anew=1, loop=Loop(1, 9, 2, 0.01, reason))).guessed is not tells
+    watch.see(replace(step(match()), anew=1, held=True))
+    assert watch.see(replace(step(match()), anew=1, held=True, loop=Loop(1, 9, 2, 0.01, reason))).guessed is not tells
+
+
+def test_a_map_begun_anew_is_no_guess_where_wheels_have_carried_the_pose() -> None:
+    watch = Watch(odometry=True)
+    watch.see(step(match()))
+    watch.observer.on_odometry(watch.t)
+    assert not watch.see(replace(step(match()), anew=1)).guessed
+    blind = Watch()
+    blind.see(step(match()))
+    assert blind.see(replace(step(match()), anew=1)).guessed, "nothing has carried it"
 
 
 def test_no_keyframe_no_guess() -> None:
