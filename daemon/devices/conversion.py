@@ -129,7 +129,7 @@ class OdometryBridge:
     """Converts cumulative odometry to increments of the base; a wrong reading, or a new origin, is no motion.
 
     Stamps are already on our clock (`RawOdometry.t_mono`); a stamp in the future is limited to the time of arrival.
-    A reading that the velocity and the largest acceleration do not explain from the last good one is held back. Later
+    A reading that the speed and the largest acceleration do not explain from the last good one is held back. Later
     ones decide: those that the last good one explains show that it was wrong. If none does for :data:`HOLD_S`, the
     wheels did move so, or the sender has a new origin where no robot is so fast.
 
@@ -152,7 +152,7 @@ class OdometryBridge:
     HOLD_S: Final = 0.5
     """Longest time, s, for which the estimator extrapolates the pose without odometry."""
     MEAN_S: Final = 0.1
-    """Shortest interval, s, of a velocity: over a shorter one, jitter of stamps dominates."""
+    """Shortest interval, s, of a speed: over a shorter one, jitter of stamps dominates."""
 
     def __init__(self) -> None:
         self.jumps = 0
@@ -161,7 +161,7 @@ class OdometryBridge:
         self._last: Reading | None = None
         self._held: list[Reading] = []
         self._since: Reading | None = None
-        self._velocity = np.zeros(3)
+        self._speed = np.zeros(2)
 
     def increment(self, raw: RawOdometry) -> Odometry | None:
         """Motion since the last good reading; None for the first one, after a jump, and while one is held back."""
@@ -180,7 +180,7 @@ class OdometryBridge:
         elif self._too_fast(self._last, reading):
             self.jumps += 1
             self._last = self._since = self._held[-1]
-            self._velocity = np.zeros(3)
+            self._speed = np.zeros(2)
         return self._accept(self._last, reading)
 
     def _accept(self, before: Reading, after: Reading) -> Odometry:
@@ -188,16 +188,14 @@ class OdometryBridge:
         self._last, self._held = (t_end, after[1]), []
         if self._since is not None and t_end - self._since[0] >= self.MEAN_S:
             moved = se2.between(self._since[1], after[1])
-            self._velocity, self._since = se2.log(moved) / (t_end - self._since[0]), self._last
+            self._speed, self._since = sizes(moved) / (t_end - self._since[0]), self._last
         return Odometry(before[0], t_end, se2.between(before[1], after[1]))
 
     def _explained(self, before: Reading, after: Reading) -> bool:
-        """Whether an acceleration of the robot explains a motion."""
+        """Whether the robot's speed and acceleration allow a motion; it may always be slower, or stop."""
         seconds = self._seconds(before, after)
-        carried = se2.exp(self._velocity * min(seconds, self.HOLD_S))
-        off = sizes(se2.between(carried, se2.between(before[1], after[1])))
-        reach = np.minimum(self.ACCELERATION * seconds, self.FASTEST) * seconds
-        return bool(np.all(off <= self.FLOOR + reach))
+        fastest = np.minimum(self._speed + self.ACCELERATION * seconds, self.FASTEST)
+        return bool(np.all(sizes(se2.between(before[1], after[1])) <= self.FLOOR + fastest * seconds))
 
     def _too_fast(self, before: Reading, after: Reading) -> bool:
         made = sizes(se2.between(before[1], after[1]))
