@@ -139,7 +139,7 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
         return False
     share, odd = match.inliers / max(1, match.queries), surprising(state, match)
     dt = state.motion.t_mono - state.matching.t_match
-    made = se2.between(state.matching.T_odom_scan, match.T_odom_base)  # wrong odometry moves the prediction alone
+    made = se2.between(state.matching.T_odom_match, match.T_odom_base)  # wrong odometry moves the prediction alone
     jump = odd and all(too_far(T, dt) for T in (match.correction, made))
     doubt.jumped |= jump
     doubt.leapt |= leapt

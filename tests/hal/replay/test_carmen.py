@@ -172,6 +172,20 @@ def test_playing_keeps_file_order_and_monotone_time(tmp_path: Path) -> None:
     assert player.lidar.geometry is not None
 
 
+@pytest.mark.parametrize("swapped", [1, 3])
+def test_scans_out_of_order_are_put_in_the_order_that_the_wheels_fit(tmp_path: Path, swapped: int) -> None:
+    """The same stamps with the wheels in file order keep that order: then the stamps are wrong."""
+    order = list(range(10))
+    for k in range(swapped):
+        order[3 * k], order[3 * k + 1] = order[3 * k + 1], order[3 * k]
+    path = write(tmp_path / "a.log", [flaser(10.0 + 0.1 * i, robot=(0.1 * i, 0.0, 0.0)) for i in order])
+    log = read_carmen(path)
+    np.testing.assert_allclose(log.stamps, 10.0 + 0.1 * np.arange(10))
+    assert any("out of order" in note for note in log.report.notes)
+    kept = write(tmp_path / "b.log", [flaser(10.0 + 0.1 * i, robot=(0.1 * n, 0.0, 0.0)) for n, i in enumerate(order)])
+    np.testing.assert_allclose(read_carmen(kept).stamps, [10.0 + 0.1 * i for i in order])
+
+
 def test_separate_odometry_is_used_where_laser_lines_have_none(tmp_path: Path) -> None:
     raw = "RAWLASER1 4 -1.570796 3.141593 0.017453 81.92 0.01 0 3 1.0 2.0 3.0 0 {t:.3f} h {t:.3f}"
     lines = []

@@ -38,6 +38,14 @@ def test_a_restarted_clock_continues_where_it_was() -> None:
     assert clock.time == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
 
 
+def test_a_clock_that_was_set_back_by_less_than_a_restart_is_bridged() -> None:
+    stamps = 0.1 * np.arange(100)
+    stamps[50:] -= 3.0
+    clock = monotone(stamps, 0.0)
+    assert clock.restarts == 1
+    np.testing.assert_allclose(np.diff(clock.time), 0.1)
+
+
 def test_one_wild_stamp_moves_nothing_after_it() -> None:
     stamps = np.array([1e9, 1e9 + 0.1, 0.0, 1e9 + 0.3, 1e9 + 0.4])
     clock = monotone(stamps, 1e9)
