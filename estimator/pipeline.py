@@ -145,7 +145,7 @@ def extend_map(state: State, scan: Scan, points: ScanPoints, limits: Limits, mat
     if match.ok:
         learn_correlation(matching, oriented(points, limits.points), motion.T_odom_base)
     frame = make_keyframe(map_, pose, motion, scan, points.turned_rad)
-    noise_m, anew = noise_of(matching, scan), lost(motion, matching)
+    noise_m, anew = noise_of(matching, scan), lost(motion, matching, not state.settings.newest_only)
     light_pose = state.settings.light_pose
     frame.virtual = virtual(pose, motion, state.light) if light_pose is None else light_pose()
     if anew and matching.local_map is not None:

@@ -64,7 +64,7 @@ def keyframe_due(
     """
     settings = map_.settings
     if matching.local_map is None or not match.ok:
-        return lost(motion, matching)
+        return lost(motion, matching, every_step)
     changed = match.inliers < settings.keyframe_share * match.queries and matching.scans_since_keyframe >= PATIENCE
     if not every_step:  # the newest keyframe is the whole map, and its error stays for good
         return changed or away(map_, pose, motion) > 1.0
@@ -74,8 +74,11 @@ def keyframe_due(
     return due
 
 
-def lost(motion: Motion, matching: MatchMemory) -> bool:
-    """Whether there is no local map, or no usable scan has matched it for long enough."""
+def lost(motion: Motion, matching: MatchMemory, every_step: bool) -> bool:
+    """Whether there is no local map, or no usable scan has matched it for long enough.
+
+    A map of one keyframe (``every_step`` False) is soon out of view.
+    """
     if matching.local_map is None:
         return True
     waited = motion.t_mono - matching.t_match
@@ -84,7 +87,7 @@ def lost(motion: Motion, matching: MatchMemory) -> bool:
     x, y, yaw = se2.between(matching.T_odom_match, motion.T_odom_base).tolist()
     gone = math.hypot(x, y) > BLOCKED_M or abs(yaw) > BLOCKED_RAD
     at_rest = motion.t_mono - motion.t_stood >= PATIENCE_S
-    return matching.failures >= PATIENCE and waited >= PATIENCE_S and (gone or at_rest)
+    return matching.failures >= PATIENCE and waited >= PATIENCE_S and (gone or at_rest or not every_step)
 
 
 def away(map_: MapState, pose: MapPose, motion: Motion) -> float:

@@ -167,9 +167,14 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
     if graph.parts.detached is None or told is None or graph.jobs.busy(state.relocalisation.search):
         return
     around = windows(state, frame)
-    if around is None and (light_is_coming(state) or state.motion.t_mono < state.relocalisation.search.t_paid):
+    if around is None and (light_is_coming(state) or held_back(state)):
         return
     look_for(state, frame, around)
+
+
+def held_back(state: Owners) -> bool:
+    """Whether a search has to wait for its share of the computer: while wheels hold the pose, there is time."""
+    return state.relocalisation.held and state.motion.t_mono < state.relocalisation.search.t_paid
 
 
 def look_for(state: Owners, frame: Keyframe, around: tuple[Around, ...] | None) -> None:
