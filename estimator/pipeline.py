@@ -314,7 +314,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         placed=alignment is not None and alignment.placed,
         gap=None if alignment is None else alignment.gap,
         places=relocalisation.places(state),
-        held=relocalisation.holds(state),
+        dead_reckoned=relocalisation.dead_reckons(state),
         apart=alignment is not None and alignment.apart,
         misplaced=misplaced(state),
         aside=map_.parts.aside is not None,

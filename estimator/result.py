@@ -304,8 +304,8 @@ class StepResult:
         protection: protection level of T_map_base; None: unavailable.
         places: None where the pose in the map is known; else the number of hypotheses: 0 none yet, 1 one under
             confirmation.
-        held: whether wheels hold a pose that a search of the map has to confirm, after a gap in which the robot may
-            have been carried off.
+        dead_reckoned: whether odometry alone carries the pose in the map, after a gap in which the robot may have been
+            kidnapped; a search of the map has to confirm it.
         aside: whether there is an unaligned map: light gives the pose, and the search in that map continues.
         let_go: number of stored maps dropped since the start, because the robot is nowhere in them.
         lag: time offset between the stamps of scans and odometry, None while it is not certain.
@@ -332,7 +332,7 @@ class StepResult:
     anew: int = 0
     protection: Protection | None = None
     places: int | None = None
-    held: bool = False
+    dead_reckoned: bool = False
     aside: bool = False
     let_go: int = 0
     lag: Lag | None = None

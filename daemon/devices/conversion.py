@@ -123,48 +123,49 @@ def in_sector(bearing_deg: Array, begin: float, end: float) -> npt.NDArray[np.bo
 
 Reading = tuple[float, Array]
 """Stamp (s) of cumulative odometry, and its pose (x, y, yaw; m, m, rad)."""
+Amount = tuple[float, float]
+"""Length (m) and angle (rad) of a motion; or per second."""
 
 
 class OdometryBridge:
     """Converts cumulative odometry to increments of the base; a wrong reading, or a new origin, is no motion.
 
     Stamps are already on our clock (`RawOdometry.t_mono`); a stamp in the future is limited to the time of arrival.
-    A reading that the speed and the largest acceleration do not explain from the last good one is held back. Later
-    ones decide: those that the last good one explains show that it was wrong. If none does for :data:`HOLD_S`, the
-    wheels did move so, or the sender has a new origin where no robot is so fast.
+    A reading that speed and acceleration do not explain from the last good reading is in doubt, and gives no increment.
+    If they explain a later one from the last good reading, those between were wrong. If that does not happen within
+    :data:`DOUBT_S`, the wheels did move so, or the sender has a new origin where no robot is so fast.
 
     Attributes:
         jumps: number of new origins. invalid: number of readings that are no numbers.
-        bridged: number of wrong readings.
     """
 
-    FASTEST: Final = np.array((5.0, 10.0))
+    FASTEST: Final = (5.0, 10.0)
     """Faster than any indoor robot, m/s and rad/s."""
-    ACCELERATION: Final = np.array((5.0, 6.0))
+    ACCELERATION: Final = (5.0, 6.0)
     """Largest acceleration of wheels that do not slip, m/s^2 (half of gravity) and rad/s^2."""
-    FLOOR: Final = np.array((0.2, 0.2))
+    FLOOR: Final = (0.2, 0.2)
     """Motion, m and rad, that jitter of stamps explains: 0.1 s of it at 2 m/s, or at 2 rad/s."""
-    JUMP: Final = np.array((0.3, 0.6))
+    JUMP: Final = (0.3, 0.6)
     """Smallest jump of the sender, m and rad, beyond the fastest motion."""
     LONGEST_S: Final = 2.0
     """Longest interval in s that extends the permitted motion: a restart of the sender after a pause must still be
     detected."""
-    HOLD_S: Final = 0.5
-    """Longest time, s, for which the estimator extrapolates the pose without odometry."""
+    DOUBT_S: Final = 0.5
+    """Longest doubt, s: for so long the estimator extrapolates the pose without odometry."""
     MEAN_S: Final = 0.1
     """Shortest interval, s, of a speed: over a shorter one, jitter of stamps dominates."""
 
     def __init__(self) -> None:
         self.jumps = 0
         self.invalid = 0
-        self.bridged = 0
         self._last: Reading | None = None
-        self._held: list[Reading] = []
+        self._doubtful: Reading | None = None  # the latest one
+        self._t_doubt = 0.0  # arrival of the first: stamps may stand still
         self._since: Reading | None = None
-        self._speed = np.zeros(2)
+        self._speed: Amount = (0.0, 0.0)
 
     def increment(self, raw: RawOdometry) -> Odometry | None:
-        """Motion since the last good reading; None for the first one, after a jump, and while one is held back."""
+        """Motion since the last good reading; None for the first one, and for one in doubt."""
         if not all(map(math.isfinite, (raw.t_mono, raw.x, raw.y, raw.yaw))):
             self.invalid += 1
             return None
@@ -172,43 +173,45 @@ class OdometryBridge:
         if self._last is None:
             self._last = self._since = reading
             return None
-        if self._explained(self._last, reading):
-            self.bridged += len(self._held)
-        elif not self._held or reading[0] - self._last[0] < self.HOLD_S:
-            self._held.append(reading)
-            return None
-        elif self._too_fast(self._last, reading):
-            self.jumps += 1
-            self._last = self._since = self._held[-1]
-            self._speed = np.zeros(2)
+        moved, seconds = amount(self._last, reading), min(max(0.0, reading[0] - self._last[0]), self.LONGEST_S)
+        if not self._explained(moved, seconds):
+            if self._doubtful is None:
+                self._t_doubt = raw.t_rx
+            if self._doubtful is None or raw.t_rx - self._t_doubt < self.DOUBT_S:
+                self._doubtful = reading
+                return None
+            if not within(moved, self.JUMP, self.FASTEST, seconds):
+                self.jumps += 1
+                self._last = self._since = self._doubtful
+                self._speed = (0.0, 0.0)
         return self._accept(self._last, reading)
+
+    def _explained(self, moved: Amount, seconds: float) -> bool:
+        """Whether the robot's speed and acceleration allow a motion; it may always be slower, or stop."""
+        v, w = (
+            min(speed + acceleration * seconds, most)
+            for speed, acceleration, most in zip(self._speed, self.ACCELERATION, self.FASTEST, strict=True)
+        )
+        return within(moved, self.FLOOR, (v, w), seconds)
 
     def _accept(self, before: Reading, after: Reading) -> Odometry:
         t_end = max(before[0], after[0])  # stamps may run backwards; the motion is real all the same
-        self._last, self._held = (t_end, after[1]), []
-        if self._since is not None and t_end - self._since[0] >= self.MEAN_S:
-            moved = se2.between(self._since[1], after[1])
-            self._speed, self._since = sizes(moved) / (t_end - self._since[0]), self._last
+        self._last, self._doubtful = (t_end, after[1]), None
+        if self._since is not None and (seconds := t_end - self._since[0]) >= self.MEAN_S:
+            far, turned = amount(self._since, after)
+            self._speed, self._since = (far / seconds, turned / seconds), self._last
         return Odometry(before[0], t_end, se2.between(before[1], after[1]))
 
-    def _explained(self, before: Reading, after: Reading) -> bool:
-        """Whether the robot's speed and acceleration allow a motion; it may always be slower, or stop."""
-        seconds = self._seconds(before, after)
-        fastest = np.minimum(self._speed + self.ACCELERATION * seconds, self.FASTEST)
-        return bool(np.all(sizes(se2.between(before[1], after[1])) <= self.FLOOR + fastest * seconds))
 
-    def _too_fast(self, before: Reading, after: Reading) -> bool:
-        made = sizes(se2.between(before[1], after[1]))
-        return bool(np.any(made > self.JUMP + self.FASTEST * self._seconds(before, after)))
-
-    def _seconds(self, before: Reading, after: Reading) -> float:
-        return min(max(0.0, after[0] - before[0]), self.LONGEST_S)
+def amount(before: Reading, after: Reading) -> Amount:
+    """Length and angle of the motion between two readings."""
+    (x0, y0, yaw0), (x1, y1, yaw1) = before[1].tolist(), after[1].tolist()
+    return math.hypot(x1 - x0, y1 - y0), abs(se2.wrap(yaw1 - yaw0))
 
 
-def sizes(moved: Array) -> Array:
-    """Length and angle (m, rad; or per s) of a motion (x, y, yaw)."""
-    x, y, yaw = moved.tolist()
-    return np.array((math.hypot(x, y), abs(yaw)))
+def within(moved: Amount, floor: Amount, speed: Amount, seconds: float) -> bool:
+    """Whether a motion is at most ``floor``, and ``speed`` for a time."""
+    return moved[0] <= floor[0] + speed[0] * seconds and moved[1] <= floor[1] + speed[1] * seconds
 
 
 class ImuBridge:

@@ -213,17 +213,17 @@ class Observer:
         Without odometry, the velocity alone predicts the pose along an axis that no match determines. A keyframe
         created then stays displaced, and every later scan fits it perfectly. Such a match shows the position in the
         surroundings, not in the map. A loop closure, an operator command or light that agrees ends this condition.
-        The same applies to every axis of a map that was restarted because no scan fitted the old one, unless wheels
-        have carried the pose. If the robot may have been kidnapped meanwhile, a loop near the predicted pose confirms
+        The same applies to every axis of a map that was restarted because no scan fitted the old one, unless odometry
+        has carried the pose. If the robot may have been kidnapped meanwhile, a loop near the predicted pose confirms
         nothing. This ends with a pose found by a search of the whole map, or confirmed by light.
         """
         told = ordered or _lit(result)
         if told or (result.loop is not None and (not self._begun or result.loop.reason in TELLING)):
             self._guessed, self._begun = [False] * 3, False
             self._t_shown = [t_mono] * 3
-        if result.anew > self._anew:
-            carried = result.held or result.places is not None
-            self._guessed, self._begun = [carried or not self.odometry_ok(t_mono)] * 3, carried
+        if result.anew > self._anew or (result.dead_reckoned and not told):
+            kidnapped = result.dead_reckoned or result.places is not None
+            self._guessed, self._begun = [kidnapped or not self.odometry_ok(t_mono)] * 3, kidnapped
         self._anew = result.anew
         for axis, known in enumerate(match.known):
             if (match.good and known) or self.odometry_ok(t_mono):

@@ -141,7 +141,7 @@ def _say_of_light(memory: Memory, evidence: Evidence, light: Light) -> tuple[Sta
 def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
     """Part of the table for a pose from the lidar: lost, degraded, unconfirmed or good.
 
-    Wheels carry a pose that no scan confirms: it is vague, and its protection level says how much, but it is not lost.
+    Odometry carries a pose that no scan confirms: its covariance grows, but it is not lost.
     """
     if evidence.sigma_m > LOST_M or evidence.sigma_rad > LOST_RAD:
         state, reason = _say_vague(evidence.light)

@@ -121,7 +121,7 @@ class Seek:
         around: light's windows in it.
         t_begin: instant of the first keyframe.
         way_begin: path length when light was first valid, m.
-        t_paid: instant up to which the searches so far have used their share of the computer, s.
+        t_paid: instant up to which the searches so far have used up their share of a core, s.
         remembered: T_map_odom of the stored pose, if the robot has not been moved since; None: not available.
     """
 
@@ -275,7 +275,7 @@ class Question:
         holds: whether the pose is confirmed in the local map.
         again: whether an earlier search ended at its cap.
         leapt: whether the scene changed.
-        alone: whether the robot had an opportunity to be carried off (`carriage`).
+        opportunity: whether there was an opportunity for a kidnapping (`kidnap_opportunity`).
         share: inlier share in the local map.
     """
 
@@ -283,7 +283,7 @@ class Question:
     holds: bool
     again: bool
     leapt: bool = False
-    alone: bool = True
+    opportunity: bool = True
     share: float = 0.0
 
 
@@ -312,7 +312,7 @@ class Suspicion:
         leap: state of the scene change detection.
         t_leap: instant of a scene change that has not been judged yet.
         leapt: whether the scene has changed.
-        alone: whether the robot had an opportunity to be carried off.
+        opportunity: whether there was an opportunity for a kidnapping that nothing has resolved.
     """
 
     fitted: int = 0
@@ -336,12 +336,17 @@ class Suspicion:
     leap: Leap = field(default_factory=Leap)
     t_leap: float = -math.inf
     leapt: bool = False
-    alone: bool = False
+    opportunity: bool = False
+
+    def settle(self) -> None:
+        """Clear the trigger, when its search has been asked for."""
+        self.fitted, self.jumped, self.odd, self.again = 0, False, False, False
+        self.leapt = self.opportunity = False
 
     def end(self) -> None:
         """Clear the trigger and abandon the search."""
-        self.leapt = self.alone = False
-        self.fitted, self.jumped, self.odd, self.question, self.again, self.since = 0, False, False, None, False, 0
+        self.settle()
+        self.question, self.since = None, 0
 
 
 def carried(frame: Keyframe, fit: Fit) -> Array:

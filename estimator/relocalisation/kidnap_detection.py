@@ -34,9 +34,10 @@ from estimator.measurements import Odometry, Scan
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
-from estimator.relocalisation import carriage, global_scan_match, relocalisation
+from estimator.relocalisation import global_scan_match, kidnap_opportunity, relocalisation
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, Verdict
 from estimator.relocalisation.hypothesis_tracking import BEHIND, Question
+from estimator.relocalisation.kidnap_opportunity import ROLLS_S
 from estimator.relocalisation.map_reset import forget_map
 from estimator.relocalisation.owners import Owners
 from estimator.relocalisation.scene_change import glance
@@ -56,12 +57,11 @@ CHANGED: Final = 0.1
 LEARNING: Final = 0.1
 """Share of the latest match in the usual values: the time between two, and the inlier share."""
 STILL_M, STILL_RAD = 0.005, 0.005
-"""Largest motion of the wheels (m, rad) at rest, over any number of readings: 0.01 m/s for `carriage.LIFT_S`."""
-ROLLS_S, RESTED_S = 0.25, 0.5
-"""Times (s) after the last motion of the wheels.
+"""Largest motion of the wheels (m, rad) at rest, over any number of readings: 0.01 m/s for `LIFT_S`."""
+RESTED_S: Final = 0.5
+"""Time (s) after the last motion of the wheels until which the usual value is measured, from `ROLLS_S` on.
 
-Before the first the robot may still roll. Between the two the usual value is measured. RESTED_S is also the time
-without odometry after which rest is unknown.
+It is also the time without odometry after which rest is unknown.
 """
 GONE_M, GONE_RAD = 0.05, 0.05
 """Motion of the wheels (m, rad) that invalidates the value measured when they stopped.
@@ -113,11 +113,6 @@ def turned(moved: Array, most_m: float = STILL_M, most_rad: float = STILL_RAD) -
     return math.hypot(x, y) > most_m or abs(yaw) > most_rad
 
 
-def rests(state: Owners) -> bool:
-    """Whether the wheels have not moved for a moment, or tell nothing."""
-    return state.motion.t_mono - state.relocalisation.suspicion.t_rest >= ROLLS_S or not state.motion.odometry
-
-
 def waits(state: Owners) -> bool:
     """Whether no keyframe may be created now, because the robot may be elsewhere."""
     doubt = state.relocalisation.suspicion
@@ -143,14 +138,14 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
     jump = odd and all(too_far(T, dt) for T in (match.correction, made))
     doubt.jumped |= jump
     doubt.leapt |= leapt
-    doubt.alone |= alone or jump or (leapt and rests(state))
+    doubt.opportunity |= alone or jump or (leapt and kidnap_opportunity.at_rest(state))
     if doubt.fitted or alone or jump or leapt:
         doubt.odd |= odd
         doubt.fitted = max(doubt.fitted + 1, ROW if leapt else 0)
     else:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
     if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt) and share > doubt.share - CHANGED:
-        doubt.fitted, doubt.alone = 0, False  # the same view from the same position
+        doubt.fitted, doubt.opportunity = 0, False  # the same view from the same position
     if doubt.question is not None and state.motion.t_mono - doubt.t_asked > GIVEN_UP_S:
         give_up(state, doubt.question)
     return doubt.fitted >= ROW and doubt.question is None
@@ -193,9 +188,9 @@ def looked_through(state: Owners, scan: Scan, points: ScanPoints, match: MatchRe
 def blocked(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
     """Whether objects before the map explain a scan that does not match, of a robot whose wheels are at rest.
 
-    People hide walls, and no beam passes through a wall for them. Where the robot was carried off, beams do.
+    People hide walls, but no beam passes through a wall because of them. After a kidnapping beams do.
     """
-    if not state.motion.t_mono - state.relocalisation.suspicion.t_rest >= ROLLS_S:
+    if not (state.motion.odometry and kidnap_opportunity.at_rest(state)):
         return False
     return 0.0 <= looked_through(state, scan, points, match) <= global_scan_match.POSSIBLE
 
@@ -224,13 +219,13 @@ def give_up(state: Owners, question: Question) -> None:
     doubt.question, doubt.fitted, doubt.odd = None, max(doubt.fitted, ROW), True
     doubt.jumped, doubt.again = doubt.jumped or question.jumped, question.again
     doubt.leapt |= question.leapt
-    doubt.alone |= question.alone
+    doubt.opportunity |= question.opportunity
 
 
 def unwatched(state: Owners) -> bool:
     """Whether the robot was at rest, or without data, for long without a match; another one has arrived now."""
     doubt, now = state.relocalisation.suspicion, state.motion.t_mono
-    usual, since, alone = doubt.period_s, now - state.matching.t_match, carriage.possible(state)
+    usual, since, alone = doubt.period_s, now - state.matching.t_match, kidnap_opportunity.since_match(state)
     doubt.t_still, doubt.moved, doubt.unwatched_s = now, np.zeros(3), 0.0
     if math.isfinite(since):
         doubt.period_s = (1.0 - LEARNING) * usual + LEARNING * min(since, 2.0 * usual) if usual else since
@@ -254,8 +249,8 @@ def look(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> N
     against = local_map.contradicted(state.matching.local_map, frame.T_odom_lidar, frame.beams(), noise_m)
     share = match.inliers / max(1, match.queries)
     holds = global_scan_match.judged(match, share, against, told) is Verdict.HOLDS
-    asked = Question(doubt.jumped, holds, doubt.again, doubt.leapt, doubt.alone, share)
-    doubt.fitted, doubt.jumped, doubt.odd, doubt.again, doubt.leapt, doubt.alone = 0, False, False, False, False, False
+    asked = Question(doubt.jumped, holds, doubt.again, doubt.leapt, doubt.opportunity, share)
+    doubt.settle()
     doubt.since = doubt.since or state.map.next_key
     older = [one for one in graph.settled() if one.first < doubt.since]
     pieces = tuple(Piece(one.key, one.T_map_submap, one.settled) for one in older if one.settled is not None)
@@ -285,30 +280,26 @@ def answered(state: Owners, asked: Question, payload: object) -> None:
     doubt.question = None
     if elsewhere(asked, payload):
         carried_off(state)
-    elif payload.complete or not asked.alone:
+    elif payload.complete or not asked.opportunity:
         doubt.since = state.map.graph.cut_at = 0
-    elif asked.again:  # a search that was cut off is no evidence: the place is neither given up nor confirmed
-        carried_off(state, held=state.motion.odometry)
+    elif asked.again:  # a search that was cut off is no evidence: the pose is neither given up nor confirmed
+        carried_off(state, dead_reckoning=state.motion.odometry)
     else:
-        doubt.fitted, doubt.odd, doubt.again, doubt.leapt, doubt.alone = (
-            ROW,
-            True,
-            True,
-            doubt.leapt or asked.leapt,
-            True,
-        )
+        doubt.fitted, doubt.odd, doubt.again, doubt.opportunity = ROW, True, True, True
+        doubt.leapt |= asked.leapt
 
 
 def elsewhere(asked: Question, looked: Looked) -> bool:
-    """Whether the search shows that the robot is at another place, given its opportunity to be carried there.
+    """Whether the search shows that the robot may be at another place.
 
-    With an opportunity, a place that fits nearly as well is as probable as the own one. So is a place that was jumped
-    to and that nothing confirms. Without one, the prior odds ask for all of the evidence: the map excludes the own
-    place, the local map does not confirm it, and another place fits as a loop does.
+    After an opportunity for a kidnapping, any place counts that fits nearly as well as the own one. The own place does
+    not suffice either if the pose jumped there and nothing confirms it. Without an opportunity the prior is so small
+    that all of this is required: the map excludes the own place, the local map does not confirm it, and another place
+    fits as a loop does.
     """
     here = looked.guesses[0]
     excluded = here.verdict is Verdict.NO
-    if not asked.alone:
+    if not asked.opportunity:
         return excluded and not asked.holds and any(fit.verdict is Verdict.HOLDS for fit, _ in looked.fresh)
     own = here.share if excluded else max(here.share, asked.share)
     least = 0.0 if asked.leapt and excluded else max(global_scan_match.LEAST, own - BEHIND)
@@ -316,15 +307,15 @@ def elsewhere(asked: Question, looked: Looked) -> bool:
     return rivals or (asked.jumped and not asked.holds and here.verdict is not Verdict.HOLDS)
 
 
-def carried_off(state: Owners, held: bool = False) -> None:
+def carried_off(state: Owners, dead_reckoning: bool = False) -> None:
     """Start relocalisation in the whole map; a map of one scan, which cannot be searched, is cleared.
 
-    ``held``: see `relocalisation.begin`.
+    ``dead_reckoning``: see `relocalisation.begin`.
     """
     graph, since = state.map.graph, state.relocalisation.suspicion.since
     first = next((one.key for one in graph.submaps.values() if one.first >= since > 0), None)
     if first is not None:
         relocalisation.disown(state, first, since)
-    if not relocalisation.afresh(state, held) and graph.parts.detached is None:
+    if not relocalisation.afresh(state, dead_reckoning) and graph.parts.detached is None:
         forget_map(state)
         state.matching.restarts += 1

@@ -19,8 +19,8 @@ class RelocalisationMemory:
         search: hypothesis set, while a part of the map is detached.
         suspicion: state of kidnap detection.
         unaligned: whether the restored map does not lie in the survey frame, and the robot has not been found in it.
-        held: whether a part of the map is detached only because the robot may have been carried off: scans did not
-            match for a while, and wheels were at rest. Wheels hold the pose until a search confirms another place.
+        dead_reckoning: whether a part of the map is detached only because there was an opportunity for a kidnapping
+            before the local map restarted. Odometry carries the pose until a search confirms another place.
         T_left, P_left: the last pose in the older map, and its covariance (3, 3; map axes) in the survey frame then.
         maps_dropped: number of stored maps dropped because the robot is nowhere in them.
     """
@@ -28,12 +28,13 @@ class RelocalisationMemory:
     search: Seek = field(default_factory=Seek)
     suspicion: Suspicion = field(default_factory=Suspicion)
     unaligned: bool = False
-    held: bool = False
+    dead_reckoning: bool = False
     T_left: Array = field(default_factory=se2.identity)
     P_left: Array = field(default_factory=lambda: np.zeros((3, 3)))
     maps_dropped: int = 0
 
     def forget(self) -> None:
         """Reset together with the map."""
-        self.search, self.suspicion, self.unaligned, self.held = Seek(), Suspicion(), False, False
+        self.search, self.suspicion = Seek(), Suspicion()
+        self.unaligned = self.dead_reckoning = False
         self.T_left, self.P_left = se2.identity(), np.zeros((3, 3))

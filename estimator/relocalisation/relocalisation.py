@@ -20,7 +20,7 @@ from estimator.mapping import live_grid
 from estimator.mapping.keyframe import Keyframe, Submap
 from estimator.mapping.map_frame import relist, unlist
 from estimator.numerics import se2
-from estimator.relocalisation import carriage
+from estimator.relocalisation import kidnap_opportunity
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, look
 from estimator.relocalisation.hypothesis_tracking import Hypothesis, SearchedAside, Seek, near
 from estimator.relocalisation.landing import SURPRISE, land
@@ -55,10 +55,10 @@ YOUNG: Final = 2
 """Fewest keyframes of a map that can be searched."""
 
 
-def begin(state: Owners, held: bool = False) -> bool:
+def begin(state: Owners, dead_reckoning: bool = False) -> bool:
     """Detach the map and start relocalisation; False where there is no map to search.
 
-    ``held``: wheels hold the pose meanwhile, see `RelocalisationMemory.held`.
+    ``dead_reckoning``: see `RelocalisationMemory`.
 
     One unfinished submap suffices: the robot begins another one, and the former is then finished. So do submaps that
     are just being finished.
@@ -74,7 +74,7 @@ def begin(state: Owners, held: bool = False) -> bool:
     state.relocalisation.suspicion.end()
     state.relocalisation.suspicion.leap.forget()
     graph.detach(state.map.next_key)
-    state.relocalisation.search, state.relocalisation.held = Seek(), held
+    state.relocalisation.search, state.relocalisation.dead_reckoning = Seek(), dead_reckoning
     aside = graph.parts.aside
     if isinstance(aside, SearchedAside):
         aside.search = Seek()
@@ -89,24 +89,23 @@ def leave_map(state: Owners) -> None:
 
 
 def local_map_lost(state: Owners) -> None:
-    """Start relocalisation after a local map restart, unless the robot was watched or current light confirms the pose.
+    """Start relocalisation after a local map restart, unless a kidnapping is excluded, by its opportunity or by light.
 
-    Wheels that roll, or the last speed for a moment, carry the pose of a robot whose view is blocked. A robot cannot be
-    lifted meanwhile (`carriage`).
+    Without an opportunity for a kidnapping (`kidnap_opportunity`), odometry or the last velocity has carried the pose.
     A light filter biased by odometry confirms the pose too, as long as the received lamps are possible here. A robot
     under relocalisation may have been carried on; the search so far is then void.
     """
-    if not carriage.open_question(state):
+    if not kidnap_opportunity.unresolved(state):
         return
-    alignment = state.pose.alignment
-    held = False
+    alignment, detached = state.pose.alignment, state.map.parts.detached is not None
+    lit = False
     if alignment is not None and light_holds(state.pose, state.motion, state.light) and alignment.gap is not None:
         from estimator.relocalisation.light_evidence import in_place
 
         here = state.pose.here(state.motion.T_odom_base)
-        held = alignment.gap <= SURPRISE or (alignment.proved and in_place(state.light, here))
-    if not held or state.map.parts.detached is not None:
-        begin(state, held=state.motion.odometry and (state.relocalisation.held or state.map.parts.detached is None))
+        lit = alignment.gap <= SURPRISE or (alignment.proved and in_place(state.light, here))
+    if not lit or detached:
+        begin(state, state.motion.odometry and (state.relocalisation.dead_reckoning or not detached))
 
 
 def forget_detached(state: Owners) -> None:
@@ -133,7 +132,7 @@ def disown(state: Owners, first: int, since: int) -> None:
 
 def places(state: Owners) -> int | None:
     """Number of hypotheses, None where the pose is known (see `StepResult.places`); light alone may know it too."""
-    if state.map.parts.detached is None or holds(state):
+    if state.map.parts.detached is None or dead_reckons(state):
         return None
     lit = light_holds(state.pose, state.motion, state.light) and blind(state.pose, state.motion)
     if lit:
@@ -143,12 +142,12 @@ def places(state: Owners) -> int | None:
     return None if lit else len(state.relocalisation.search.alive)
 
 
-def holds(state: Owners) -> bool:
-    """Whether wheels hold the pose of a detached part, and no search has confirmed another place.
+def dead_reckons(state: Owners) -> bool:
+    """Whether odometry carries the pose of a detached part, and no search has confirmed another place.
 
-    A view that is blocked is far more probable than a robot that was carried off, until something shows the latter.
+    Until then a blocked view is far more probable than a kidnapping.
     """
-    if not state.relocalisation.held or state.map.parts.detached is None:
+    if not state.relocalisation.dead_reckoning or state.map.parts.detached is None:
         return False
     T = state.motion.T_odom_base
     here = state.pose.here(T)
@@ -158,6 +157,7 @@ def holds(state: Owners) -> bool:
 
 def hinted(state: Owners) -> None:
     """Restart the search around an operator pose."""
+    state.relocalisation.dead_reckoning = False
     state.relocalisation.search = Seek(terrain=state.relocalisation.search.terrain, hint=(state.pose.T_map_odom, 0))
 
 
@@ -167,14 +167,14 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
     if graph.parts.detached is None or told is None or graph.jobs.busy(state.relocalisation.search):
         return
     around = windows(state, frame)
-    if around is None and (light_is_coming(state) or held_back(state)):
+    if around is None and (light_is_coming(state) or search_waits(state)):
         return
     look_for(state, frame, around)
 
 
-def held_back(state: Owners) -> bool:
-    """Whether a search has to wait for its share of the computer: while wheels hold the pose, there is time."""
-    return state.relocalisation.held and state.motion.t_mono < state.relocalisation.search.t_paid
+def search_waits(state: Owners) -> bool:
+    """Whether a search has to wait for its share of a core. Only while odometry carries the pose there is time."""
+    return state.relocalisation.dead_reckoning and state.motion.t_mono < state.relocalisation.search.t_paid
 
 
 def look_for(state: Owners, frame: Keyframe, around: tuple[Around, ...] | None) -> None:
@@ -296,9 +296,9 @@ def doubt(state: Owners) -> None:
         alignment.elsewhere_since, alignment.aside_since, alignment.broken = None, None, True
 
 
-def afresh(state: Owners, held: bool = False) -> bool:
-    """Detach the map from the next scan on, with a new local map; ``held``: see :func:`begin`."""
-    if not begin(state, held):
+def afresh(state: Owners, dead_reckoning: bool = False) -> bool:
+    """Detach the map from the next scan on, with a new local map; ``dead_reckoning``: see :func:`begin`."""
+    if not begin(state, dead_reckoning):
         return False
     state.matching.local_map, state.matching.failures = None, 0
     return True

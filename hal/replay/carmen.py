@@ -22,7 +22,7 @@ from hal.odometry import RawOdometry
 from hal.replay.carmen_lines import LaserLine, LineProblem, OdometryLine, ParameterLine, parse
 from hal.replay.carmen_scans import CarmenScan, convert
 from hal.replay.geometry_guess import beam_geometry
-from hal.replay.monotone_stamps import Monotone, monotone
+from hal.replay.monotone_stamps import LASTS, Monotone, monotone
 from hal.replay.mount import log_mount
 from hal.replay.report import LogReport
 from hal.replay.text import Torn, lines
@@ -203,18 +203,18 @@ def _usable(lasers: list[LaserLine], report: LogReport) -> list[LaserLine]:
 def _ordered(lasers: list[LaserLine], report: LogReport) -> list[LaserLine]:
     """The scans in the order in which they were taken: that of the file, or that of their stamps.
 
-    Where stamps run backwards, one of the two is wrong. The wheels decide: in the wrong order the robot drives to and
-    fro, so its path is longer.
+    Where a few stamps run backwards, one of the two is wrong. The wheels decide: in the wrong order the robot drives to
+    and fro, so its path is longer. A clock that was set displaces all scans that follow, and leaves the file's order.
     """
-    stamps = np.array([line.stamp for line in lasers])
-    order = np.argsort(stamps, kind="stable")
-    moved = np.flatnonzero(order != np.arange(len(order)))
-    if not len(moved) or any(line.robot is None for line in lasers):
+    order = np.argsort([line.stamp for line in lasers], kind="stable")
+    away = np.abs(order - np.arange(len(order)))
+    if not 0 < away.max() < LASTS or any(line.robot is None for line in lasers):
         return lasers
     poses = np.array([line.robot for line in lasers])
     if not _path(poses[order]) < _path(poses):
         return lasers
-    report.notes.append(f"{len(moved)} scans are out of order: put in the order of their stamps, which the wheels fit")
+    moved = np.count_nonzero(away)
+    report.notes.append(f"{moved} scans are out of order: put in the order of their stamps, which the wheels fit")
     return [lasers[k] for k in order.tolist()]
 
 

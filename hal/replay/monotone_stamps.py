@@ -2,9 +2,8 @@
 
 Two defects are distinguished. *Scatter*: small backward steps, because several processes or a later reconstruction
 wrote the stamps. The file order is right and the stamps are noisy; the time is the least-squares increasing sequence
-(isotonic regression). *A restarted clock*: a step that is too large for scatter, or
-that lasts. The following stamps are shifted so that they
-continue the log. The records keep their original stamps.
+(isotonic regression). *A restarted clock*: a step that is too large for scatter, or that lasts. The
+following stamps are shifted so that they continue the log. The records keep their original stamps.
 """
 
 from __future__ import annotations

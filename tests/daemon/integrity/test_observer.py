@@ -145,19 +145,19 @@ def test_a_loop_closure_tells_the_place() -> None:
 
 
 def test_a_map_begun_anew_is_a_guess_whatever_fits_it() -> None:
-    """The robot may have been carried off before: wheels hold the pose, and only a search can confirm it."""
+    """The robot may have been kidnapped before: odometry carries the pose, and only a search can confirm it."""
     watch = Watch(odometry=True)
     assert not watch.see(step(match())).guessed
-    begun = watch.see(replace(step(match()), anew=1, held=True))
+    begun = watch.see(replace(step(match()), anew=1, dead_reckoned=True))
     assert begun.guessed
     assert begun.match is not None
     assert begun.match.known == (False, False, False)
-    later = watch.see(replace(step(match()), anew=1, held=True))
+    later = watch.see(replace(step(match()), anew=1, dead_reckoned=True))
     assert later.guessed
-    ordered = watch.see(replace(step(match()), anew=1, held=True), Command(0.0, Order.SET_POSE, np.zeros(3)))
+    ordered = watch.see(replace(step(match()), anew=1, dead_reckoned=True), Command(0.0, Order.SET_POSE, np.zeros(3)))
     assert not ordered.guessed
-    assert not watch.see(replace(step(match()), anew=1, held=True)).guessed
-    assert watch.see(replace(step(match()), anew=2, held=True)).guessed, "and begun once more"
+    assert not watch.see(replace(step(match()), anew=1)).guessed
+    assert watch.see(replace(step(match()), anew=2, dead_reckoned=True)).guessed, "and begun once more"
 
 
 @pytest.mark.parametrize(("reason", "tells"), [(why, why.name in ("PLACED", "LIT")) for why in LoopReason])
@@ -165,8 +165,19 @@ def test_after_a_map_was_begun_anew_only_a_search_everywhere_tells_the_place(rea
     """A robot that was carried off to where it looks alike closes loops there as it would at the right place."""
     watch = Watch(odometry=True)
     watch.see(step(match()))
-    watch.see(replace(step(match()), anew=1, held=True))
-    assert watch.see(replace(step(match()), anew=1, held=True, loop=Loop(1, 9, 2, 0.01, reason))).guessed is not tells
+    watch.see(replace(step(match()), anew=1, dead_reckoned=True))
+    found = replace(step(match()), anew=1, dead_reckoned=not tells, loop=Loop(1, 9, 2, 0.01, reason))
+    assert watch.see(found).guessed is not tells
+
+
+def test_a_pose_by_dead_reckoning_is_a_guess_although_no_map_was_begun_anew() -> None:
+    """A search that its cap ended leaves the pose unconfirmed, without a restart of the local map."""
+    watch = Watch(odometry=True)
+    watch.see(step(match()))
+    watch.observer.on_odometry(watch.t)
+    assert watch.see(replace(step(match()), dead_reckoned=True)).guessed
+    assert watch.see(replace(step(match()), dead_reckoned=True, loop=Loop(1, 9, 2, 0.01, LoopReason.NEAR))).guessed
+    assert not watch.see(replace(step(match()), loop=Loop(2, 9, 2, 0.01, LoopReason.PLACED))).guessed
 
 
 def test_a_map_begun_anew_is_no_guess_where_wheels_have_carried_the_pose() -> None:

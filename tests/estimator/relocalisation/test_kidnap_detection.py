@@ -225,7 +225,7 @@ def test_a_map_of_one_scan_is_begun_anew_where_the_robot_was_put_down() -> None:
 def test_a_search_that_had_to_be_ended_does_not_say_that_there_is_no_other_place(
     covered: bool, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The search is repeated once with all nodes. Then the place is neither given up nor confirmed."""
+    """The search is repeated once with all nodes. Then the pose is neither given up nor confirmed."""
     robot = driven(IMAGE, ABOUT)
     assert robot.T is not None
     monkeypatch.setattr(kidnap_detection, "NODES", 300)
@@ -321,7 +321,7 @@ def test_a_jump_while_a_look_is_under_way_is_not_forgotten() -> None:
 def test_after_a_leap_it_is_adrift_where_another_place_fits(
     own: Verdict, share: float, others: tuple[float, ...], complete: bool, carried: bool | None
 ) -> None:
-    """None: the search is repeated once; then the place is held, and searched on."""
+    """None: the search is repeated once; then odometry carries the pose, and the search goes on."""
     robot = driven(IMAGE, ABOUT)
     assert robot.T is not None
     state = robot.state

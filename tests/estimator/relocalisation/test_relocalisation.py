@@ -212,9 +212,11 @@ def test_carried_to_another_room_and_what_was_mapped_since_comes_along(
     robot = Robot(stored(submaps), scene)
     assert robot.along(way(HALL, 0.06))[-1] is None
     poses = way(((9.05, 1.5), (9.05, 6.0), (7.0, 6.0)), 0.06)
-    for _ in range(10):  # the second in which somebody carries it
+    for _ in range(10):  # it is kidnapped: a second at rest, with the lidar covered
         robot.at(poses[0], carried=True, covered=True)
-    assert set(robot.along(poses, carried=True)) == {None}, "wheels hold the pose until a search knows better"
+    assert set(robot.along(poses, carried=True)) == {None}, (
+        "odometry carries the pose until a search confirms another one"
+    )
     for T in poses[31:]:
         robot.at(T)
     assert robot.state.map.parts.detached is None, "found"

@@ -186,6 +186,14 @@ def test_scans_out_of_order_are_put_in_the_order_that_the_wheels_fit(tmp_path: P
     np.testing.assert_allclose(read_carmen(kept).stamps, [10.0 + 0.1 * i for i in order])
 
 
+def test_a_clock_set_back_in_a_closed_drive_reorders_nothing(tmp_path: Path) -> None:
+    """The second half before the first makes a shorter path where the drive ends at its start."""
+    x = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0, 0.5, 0.0]
+    stamps = [10.0 + 0.1 * k - 50.0 * (k >= 10) for k in range(20)]
+    log = read_carmen(write(tmp_path / "a.log", [flaser(t, robot=(x[k], 0.0, 0.0)) for k, t in enumerate(stamps)]))
+    assert log.stamps.tolist() == stamps
+
+
 def test_separate_odometry_is_used_where_laser_lines_have_none(tmp_path: Path) -> None:
     raw = "RAWLASER1 4 -1.570796 3.141593 0.017453 81.92 0.01 0 3 1.0 2.0 3.0 0 {t:.3f} h {t:.3f}"
     lines = []
