@@ -46,6 +46,7 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.relocalisation import (
     kidnap_detection,
+    kidnap_opportunity,
     relocalisation,
     relocalisation_check,
     unaligned_map,
@@ -113,7 +114,7 @@ def see(state: State, scan: Scan, limits: Limits, refusal: Reason | None, lap: L
     if suspected:
         kidnap_detection.look(state, scan, points, match)
     lap("match")
-    if not (limits.update_map and limits.level < DegradationLevel.NO_MAP and extends_map(state, scan, points, match)):
+    if not (limits.update_map and limits.level < DegradationLevel.NO_MAP and extends_map(state, points, match)):
         return match, -1
     keyframe = extend_map(state, scan, points, limits, match)
     lap("map")
@@ -129,11 +130,11 @@ def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
     time_offset.on_match(state.time_offset, scan, match)
 
 
-def extends_map(state: State, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
+def extends_map(state: State, points: ScanPoints, match: MatchResult) -> bool:
     """Whether a keyframe is due; never with too few points, nor where it may have been kidnapped, or stands blocked."""
     if (match.ok and kidnap_detection.waits(state)) or len(points.xy) < state.settings.matching.min_points:
         return False
-    if not match.ok and kidnap_detection.blocked(state, scan, points, match):
+    if not match.ok and kidnap_opportunity.blocked(state):
         return False
     every_step = not state.settings.newest_only
     return keyframe_due(state.map, state.pose, state.motion, state.matching, match, every_step)

@@ -288,6 +288,20 @@ class Question:
 
 
 @dataclass(slots=True, eq=False)
+class Contradiction:
+    """Mean share of the local map in view that the scans since the last match see through; ``count`` of them."""
+
+    count: int = 0
+    mean: float = 0.0
+
+    def add(self, share: float) -> None:
+        """Add a scan that did not match; a negative share is no evidence."""
+        if share >= 0.0:
+            self.count += 1
+            self.mean += (share - self.mean) / self.count
+
+
+@dataclass(slots=True, eq=False)
 class Suspicion:
     """State of kidnap detection (`kidnap_detection`).
 
@@ -304,6 +318,7 @@ class Suspicion:
         gone: motion of the wheels since then.
         strange_s: total duration of a larger share since.
         t_strange: latest instant of it.
+        contradiction: of the scans since the last match.
         period_s: usual time between two matches, 0 before it is known.
         question: question of the running search, None: there is none.
         t_asked: instant of its start.
@@ -337,6 +352,7 @@ class Suspicion:
     t_leap: float = -math.inf
     leapt: bool = False
     opportunity: bool = False
+    contradiction: Contradiction = field(default_factory=Contradiction)
 
     def settle(self) -> None:
         """Clear the trigger, when its search has been asked for."""

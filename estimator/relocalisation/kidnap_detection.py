@@ -36,7 +36,7 @@ from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
 from estimator.relocalisation import global_scan_match, kidnap_opportunity, relocalisation
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, Verdict
-from estimator.relocalisation.hypothesis_tracking import BEHIND, Question
+from estimator.relocalisation.hypothesis_tracking import BEHIND, Contradiction, Question
 from estimator.relocalisation.kidnap_opportunity import ROLLS_S
 from estimator.relocalisation.map_reset import forget_map
 from estimator.relocalisation.owners import Owners
@@ -124,6 +124,8 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
     """Whether the search has to start now; called before the match is fused."""
     doubt, graph = state.relocalisation.suspicion, state.map.graph
     strange = was_strange(state, scan, points, match)
+    if not match.ok:
+        doubt.contradiction.add(excluded_share(state, scan, points, match))
     if not match.ok or state.matching.local_map is None:
         return False
     alone, leapt = unwatched(state), leaps(state, scan, points, match, strange)
@@ -185,14 +187,18 @@ def looked_through(state: Owners, scan: Scan, points: ScanPoints, match: MatchRe
     return local_map.looked_through(state.matching.local_map, eye, beams, noise_of(state.matching, scan))
 
 
-def blocked(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> bool:
-    """Whether objects before the map explain a scan that does not match, of a robot whose wheels are at rest.
+def excluded_share(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> float:
+    """Share of the local map that a scan sees through at the predicted pose; negative if the prediction is too vague.
 
-    People hide walls, but no beam passes through a wall because of them. After a kidnapping beams do.
+    The test has a margin for range noise. Two sigmas of the prediction, at the median range, must lie within it.
     """
-    if not (state.motion.odometry and kidnap_opportunity.at_rest(state)):
-        return False
-    return 0.0 <= looked_through(state, scan, points, match) <= global_scan_match.POSSIBLE
+    if not len(points.xy):
+        return -1.0
+    P, far = state.motion.P, float(np.median(np.hypot(*points.xy.T)))
+    sigma_m = math.sqrt(P[0, 0] + P[1, 1] + far * far * P[2, 2])
+    if 2.0 * sigma_m > local_map.MARGIN + 5.0 * noise_of(state.matching, scan):
+        return -1.0
+    return looked_through(state, scan, points, match)
 
 
 def leaps(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult, strange: bool) -> bool:
@@ -227,6 +233,7 @@ def unwatched(state: Owners) -> bool:
     doubt, now = state.relocalisation.suspicion, state.motion.t_mono
     usual, since, alone = doubt.period_s, now - state.matching.t_match, kidnap_opportunity.since_match(state)
     doubt.t_still, doubt.moved, doubt.unwatched_s = now, np.zeros(3), 0.0
+    doubt.contradiction = Contradiction()
     if math.isfinite(since):
         doubt.period_s = (1.0 - LEARNING) * usual + LEARNING * min(since, 2.0 * usual) if usual else since
     return usual > 0.0 and alone

@@ -1,14 +1,15 @@
-"""Opportunity for a kidnapping: how long nothing has shown that the robot drives on its own wheels.
+"""Opportunity for a kidnapping, and evidence of one: what odometry and scans show since the last match.
 
 A robot that is lifted is at rest on its wheels, or nothing is received from it. While wheels roll, or scans match, it
-drives. The prior probability of a kidnapping is then of the order of 1e-5 per second, and no gap in the matches changes
-that. So every decision against the present pose asks first whether there was an opportunity.
+drives. The prior probability of a kidnapping is then of the order of 1e-5 per second, and scans that do not match do
+not change that: people and glass hide the map. Only scans that see through the map do. No object explains those.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
+from estimator.relocalisation.global_scan_match import POSSIBLE
 from estimator.relocalisation.owners import Owners
 
 LIFT_S, MISSED = 0.5, 4.0
@@ -29,10 +30,25 @@ def since_match(state: Owners) -> bool:
     return unwatched_s(state) >= max(LIFT_S, MISSED * usual)
 
 
+def contradicted(state: Owners) -> bool:
+    """Whether the scans since the last match see through more of the map than a right pose permits."""
+    return state.relocalisation.suspicion.contradiction.mean > POSSIBLE
+
+
+def blocked(state: Owners) -> bool:
+    """Whether objects before the map explain the scans since the last match, of a robot whose wheels are at rest."""
+    usable = state.relocalisation.suspicion.contradiction.count > 0
+    return state.motion.odometry and at_rest(state) and usable and not contradicted(state)
+
+
 def unresolved(state: Owners) -> bool:
-    """Whether there was an opportunity since the last match, or an earlier one that no match or search has resolved."""
+    """Whether the robot may have been kidnapped: now, or earlier and no match or search has resolved that.
+
+    Without odometry nothing but matches shows that it drives.
+    """
     doubt = state.relocalisation.suspicion
-    return since_match(state) or doubt.opportunity or (doubt.question is not None and doubt.question.opportunity)
+    earlier = doubt.opportunity or (doubt.question is not None and doubt.question.opportunity)
+    return not state.motion.odometry or earlier or since_match(state) or contradicted(state)
 
 
 def at_rest(state: Owners) -> bool:
