@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from estimator.mapping.constraints import Constraints
-from estimator.mapping.spanning_tree_step import spanning
+from estimator.mapping.pose_graph_kernels import spanning
 from estimator.numerics.arrays import Array, Bools, Ints
 from estimator.numerics.elimination_ordering import NONE
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimator.mapping.spanning_tree_step import carry_on, spanning
+from estimator.mapping.pose_graph_kernels import carry_on, spanning
 from estimator.numerics import se2
 
 

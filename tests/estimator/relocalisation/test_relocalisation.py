@@ -211,13 +211,12 @@ def test_carried_to_another_room_and_what_was_mapped_since_comes_along(
     scene, submaps = floor
     robot = Robot(stored(submaps), scene)
     assert robot.along(way(HALL, 0.06))[-1] is None
+    detached = []
     for k, T in enumerate(way(((9.05, 1.5), (9.05, 6.0), (7.0, 6.0)), 0.06)):
         robot.at(T, carried=k == 0)
-        if k == 30:
-            assert robot.state.map.parts.detached is not None, (
-                "scans have seen through the map; no search was asked for"
-            )
-    assert robot.state.map.parts.detached is None, "found"
+        detached.append(robot.state.map.parts.detached is not None)
+    assert True in detached, "scans see through the map"
+    assert not detached[-1], "found"
     assert robot.off()[0] < 0.1
     assert robot.state.matching.restarts == 1
 
