@@ -131,10 +131,10 @@ def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
 
 
 def extends_map(state: State, points: ScanPoints, match: MatchResult) -> bool:
-    """Whether a keyframe is due; never with too few points, nor where it may have been kidnapped, or stands blocked."""
+    """Whether a keyframe is due; never with too few points, nor by scans that cannot be trusted."""
     if (match.ok and kidnap_detection.waits(state)) or len(points.xy) < state.settings.matching.min_points:
         return False
-    if not match.ok and kidnap_opportunity.blocked(state):
+    if not match.ok and (kidnap_opportunity.blocked(state) or relocalisation.lidar_is_wrong(state)):
         return False
     every_step = not state.settings.newest_only
     return keyframe_due(state.map, state.pose, state.motion, state.matching, match, every_step)

@@ -14,6 +14,8 @@ from estimator.relocalisation.owners import Owners
 
 LIFT_S, MISSED = 0.5, 4.0
 """Time (s) that suffices to lift the robot and put it down, also in scan periods: a few lost scans are normal."""
+MOST: Final = 0.5
+"""Share of the map in view that is seen through, above which the place or the lidar is wrong: not the surroundings."""
 ROLLS_S: Final = 0.25
 """Time (s) after the last motion of the wheels for which the robot may still roll."""
 
@@ -33,6 +35,11 @@ def since_match(state: Owners) -> bool:
 def contradicted(state: Owners) -> bool:
     """Whether the scans since the last match see through more of the map than a right pose permits."""
     return state.relocalisation.suspicion.contradiction.mean > POSSIBLE
+
+
+def mostly_excluded(state: Owners) -> bool:
+    """Whether the scans since the last match see through most of the map in view."""
+    return state.relocalisation.suspicion.contradiction.mean > MOST
 
 
 def blocked(state: Owners) -> bool:

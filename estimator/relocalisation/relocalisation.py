@@ -97,15 +97,28 @@ def local_map_lost(state: Owners) -> None:
     """
     if not kidnap_opportunity.unresolved(state):
         return
-    alignment, detached = state.pose.alignment, state.map.parts.detached is not None
-    lit = False
-    if alignment is not None and light_holds(state.pose, state.motion, state.light) and alignment.gap is not None:
-        from estimator.relocalisation.light_evidence import in_place
-
-        here = state.pose.here(state.motion.T_odom_base)
-        lit = alignment.gap <= SURPRISE or (alignment.proved and in_place(state.light, here))
-    if not lit or detached:
+    detached = state.map.parts.detached is not None
+    if not lit(state) or detached:
         begin(state, state.motion.odometry and (state.relocalisation.dead_reckoning or not detached))
+
+
+def lit(state: Owners) -> bool:
+    """Whether light confirms the pose: its solution agrees, or the received lamps are possible here."""
+    alignment = state.pose.alignment
+    if alignment is None or alignment.gap is None or not light_holds(state.pose, state.motion, state.light):
+        return False
+    from estimator.relocalisation.light_evidence import in_place
+
+    here = state.pose.here(state.motion.T_odom_base)
+    return alignment.gap <= SURPRISE or (alignment.proved and in_place(state.light, here))
+
+
+def lidar_is_wrong(state: Owners) -> bool:
+    """Whether light confirms the pose while scans see through most of the map; such scans begin no new local map.
+
+    Light and odometry carry the pose. The map stays as it is until the scans fit again.
+    """
+    return kidnap_opportunity.mostly_excluded(state) and lit(state)
 
 
 def forget_detached(state: Owners) -> None:
