@@ -84,6 +84,8 @@ if TYPE_CHECKING:
     from estimator.result import LoopReason as LoopReason
     from estimator.result import MatchResult as MatchResult
     from estimator.result import Reason as Reason
+    from estimator.result import SlowError as SlowError
+    from estimator.result import SlowErrors as SlowErrors
     from estimator.result import StepResult as StepResult
     from estimator.result import Virtual as Virtual
     from estimator.scan_matching import icp as icp
@@ -113,7 +115,10 @@ NAMES_OF: Final = {
     ),
     "numerics.arrays": "Array",
     # results of a step
-    "result": "Fix LightsResult Link LinkState Loop LoopReason MatchResult Reason StepResult SURPRISE Virtual",
+    "result": (
+        "Fix LightsResult Link LinkState Loop LoopReason MatchResult Reason SlowError SlowErrors StepResult SURPRISE "
+        "Virtual"
+    ),
     # CDMA: air interface, decoder, sample blocks and epochs
     "cdma.air_interface": "PROFILES Profile",
     "cdma.gold_codes": "gold_codes",

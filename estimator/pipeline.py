@@ -8,10 +8,17 @@ from collections.abc import Iterable
 import numpy as np
 
 from estimator.commands import obey
-from estimator.fusion import map_odom_filter, motion_model, out_of_sequence, protection_level, time_offset
+from estimator.fusion import (
+    map_odom_filter,
+    motion_model,
+    out_of_sequence,
+    protection_level,
+    time_offset,
+    wheel_calibration,
+)
 from estimator.fusion.laser_odometry import guide
 from estimator.fusion.light_witness import KNOWN, virtual
-from estimator.fusion.pose_update import beams_per_sample, fuse, learn_correlation, noise_of
+from estimator.fusion.pose_update import beams_per_sample, fuse, learn_correlation, loose_direction, noise_of
 from estimator.mapping import live_grid, loop_closure
 from estimator.mapping.keyframe import hanging
 from estimator.mapping.keyframe_selection import (
@@ -128,6 +135,8 @@ def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
         state.map.graph.loosen(more, state.pose.T_odom_anchor)
     guide(state.light, state.motion, match)
     time_offset.on_match(state.time_offset, scan, match)
+    complete = match.ok and bool(match.known_axes.all()) and loose_direction(match.information) is None
+    wheel_calibration.on_match(state.wheels, state.motion.t_mono, state.motion.T_odom_base, complete)
 
 
 def extends_map(state: State, points: ScanPoints, match: MatchResult) -> bool:
@@ -215,7 +224,8 @@ def predict(state: State, record: Record) -> None:
         state.light.predict(record)
     match record:
         case Odometry():
-            motion_model.on_odometry(state.motion, record, noise)
+            motion_model.on_odometry(state.motion, wheel_calibration.corrected(state.wheels, record), noise)
+            wheel_calibration.on_odometry(state.wheels, record)
             time_offset.on_odometry(state.time_offset, record)
             kidnap_detection.on_odometry(state, record)
         case Imu():
@@ -321,9 +331,10 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         aside=map_.parts.aside is not None,
         let_go=state.relocalisation.maps_dropped,
         lag=state.time_offset.told,
+        slow=state.wheels.told,
         jobs=state.jobs.take() if limits.level < DegradationLevel.NO_MAP else (),
         anew=state.matching.restarts,
-        protection=protection_level.bound(pose, motion, state.light, state.matching, P),
+        protection=protection_level.bound(pose, motion, state.light, state.matching, P, state.wheels.mount_rad),
     )
 
 

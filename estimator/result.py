@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import Enum
+from enum import Enum, IntEnum
 from typing import Final
 
 import numpy as np
@@ -276,6 +276,40 @@ class Lag:
     sigma_s: float
 
 
+class SlowError(IntEnum):
+    """Lasting errors of odometry and lidar mount."""
+
+    DISTANCE = 0  # true distance over that of odometry, less 1
+    TURN = 1  # true turn over that of odometry, less 1
+    DRIFT = 2  # turn per metre that odometry misses, rad/m
+    MOUNT_YAW = 3  # yaw of the lidar mount less the configured one, rad
+    MOUNT_Y = 4  # its y less the configured one, m
+
+
+@dataclass(frozen=True, slots=True)
+class SlowErrors:
+    """Estimated :class:`SlowError` (`wheel_calibration`), of which one at least is beyond a sound robot's.
+
+    Attributes:
+        value, sigma: of each error, in its unit.
+        large: whether it is beyond a sound robot's.
+    """
+
+    value: tuple[float, ...]
+    sigma: tuple[float, ...]
+    large: tuple[bool, ...]
+
+    @property
+    def wheels(self) -> bool:
+        """Whether an error of odometry is large."""
+        return any(self.large[: SlowError.MOUNT_YAW])
+
+    @property
+    def mount(self) -> bool:
+        """Whether an error of the lidar mount is large."""
+        return any(self.large[SlowError.MOUNT_YAW :])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class StepResult:
     """The estimate after one `step`.
@@ -309,6 +343,7 @@ class StepResult:
         aside: whether there is an unaligned map: light gives the pose, and the search in that map continues.
         let_go: number of stored maps dropped since the start, because the robot is nowhere in them.
         lag: time offset between the stamps of scans and odometry, None while it is not certain.
+        slow: lasting errors of wheels and lidar mount, None while none is large.
         jobs: work for the background worker; each result returns as a record of a later step.
     """
 
@@ -336,4 +371,5 @@ class StepResult:
     aside: bool = False
     let_go: int = 0
     lag: Lag | None = None
+    slow: SlowErrors | None = None
     jobs: tuple[Job, ...] = ()

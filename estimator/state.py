@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from estimator.fusion.map_pose import MapPose, SurveyAlignment
 from estimator.fusion.motion_model import Motion, MotionNoise
 from estimator.fusion.time_offset import TimeOffset
+from estimator.fusion.wheel_calibration import WheelCalibration
 from estimator.job_queue import JobQueue
 from estimator.mapping.live_grid import LiveGrid
 from estimator.mapping.map_state import MappingSettings, MapState
@@ -73,6 +74,7 @@ class State:
         matching: state of scan matching.
         relocalisation: hypotheses of the pose in the map, while it is not known.
         time_offset: between the stamps of scans and odometry.
+        wheels: lasting errors of odometry and lidar mount.
         journal: called with every match before it is fused, None without a journal.
     """
 
@@ -85,6 +87,7 @@ class State:
     matching: MatchMemory = field(default_factory=MatchMemory)
     relocalisation: RelocalisationMemory = field(default_factory=RelocalisationMemory)
     time_offset: TimeOffset = field(default_factory=TimeOffset)
+    wheels: WheelCalibration = field(default_factory=WheelCalibration)
     journal: Journal | None = None
 
     def use(self, settings: Settings) -> None:

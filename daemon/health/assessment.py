@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
 from daemon.health.faults import FAULTS, Fault
+from estimator import SlowError, SlowErrors
 from hal.adc import BusStuck, ChipMissing, Clipping, Dark, Dazzled, NoSignal, WrongChip
 from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.lidar import Link
@@ -20,7 +22,8 @@ FEW: Final = 2
 REPLAYED: Final = frozenset(
     (
         *(Fault.NO_LAMPS, Fault.SURVEY_CONTRADICTED, Fault.TWIN_LAMPS, Fault.LAMP_MOVED, Fault.LAMP_DEAD),
-        *(Fault.LIDAR_MISFIT, Fault.ODOMETRY_SILENT, Fault.ODOMETRY_DISAGREES, Fault.PROTECTION_ALERT),
+        *(Fault.LIDAR_MISFIT, Fault.LIDAR_TURNED, Fault.ODOMETRY_SILENT, Fault.ODOMETRY_DISAGREES),
+        *(Fault.ODOMETRY_SCALE, Fault.PROTECTION_ALERT),
     )
 )
 """Faults that follow from the data alone, so that a replay reproduces them. All others come from drivers or from the
@@ -36,6 +39,7 @@ class Vitals:
         scans, missed, invalid: the driver's counters. period: scan period in seconds.
         late: counter of scans that arrived late. lag: time offset in s of the scan stamps behind the odometry, 0: not
             available. misfit: scans are inconsistent with the map.
+        slow: lasting errors of odometry and lidar mount, None while none is large.
         odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the lidar.
         readings, readings_missed, readings_old: counters of odometry readings that arrived, were lost, and arrived
             late.
@@ -63,6 +67,7 @@ class Vitals:
     late: int = 0
     misfit: bool = False
     lag: float = 0.0
+    slow: SlowErrors | None = None
     readings: int = 0
     readings_missed: int = 0
     readings_old: int = 0
@@ -111,8 +116,26 @@ def _words(fault: Fault, now: Vitals) -> str:
         return str(now.adc_error)
     if fault in (Fault.PUBLISHER_FAILED, Fault.PART_FAILED):
         return ", ".join(sorted(_publishers(now) if fault is Fault.PUBLISHER_FAILED else _others(now)))
+    if fault in (Fault.LIDAR_TURNED, Fault.ODOMETRY_SCALE) and now.slow is not None:
+        return _of_mount(now.slow) if fault is Fault.LIDAR_TURNED else _of_wheels(now.slow)
     late = fault is (Fault.LIDAR_LATE if now.lag > 0.0 else Fault.ODOMETRY_GAPS)
     return f"scans are {now.lag:+.2f} s late against the wheels" if now.lag and late else ""
+
+
+def _of_mount(slow: SlowErrors) -> str:
+    """Estimated deviation of the lidar mount."""
+    (yaw, yaw_sigma), (y, y_sigma) = zip(
+        slow.value[SlowError.MOUNT_YAW :], slow.sigma[SlowError.MOUNT_YAW :], strict=True
+    )
+    turned = f"{math.degrees(yaw):+.1f} deg (sigma {math.degrees(yaw_sigma):.1f})"
+    return f"its yaw differs from `lidar.mount` by {turned}, its y by {100.0 * y:+.0f} cm (sigma {100.0 * y_sigma:.0f})"
+
+
+def _of_wheels(slow: SlowErrors) -> str:
+    """Estimated errors of odometry."""
+    way, turn, drift, _, _ = slow.value
+    scales = f"multiply its distances by {1.0 + way:.2f} and its turns by {1.0 + turn:.2f}"
+    return f"{scales}; driving straight on, it misses {math.degrees(drift):+.1f} deg per metre"
 
 
 def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
@@ -130,6 +153,8 @@ def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.LIDAR_LATE
     if now.misfit:
         yield Fault.LIDAR_MISFIT
+    if now.slow is not None and now.slow.mount:
+        yield Fault.LIDAR_TURNED
 
 
 def _noun(error: HalError) -> Fault:
@@ -186,6 +211,8 @@ def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
     bad = missed > FEW + 0.05 * (readings + missed) or old > FEW + 0.05 * readings or now.readings_seldom
     if now.odometry and (bad or now.lag < 0.0):
         yield Fault.ODOMETRY_GAPS
+    if now.slow is not None and now.slow.wheels:
+        yield Fault.ODOMETRY_SCALE
     if now.alert:
         yield Fault.PROTECTION_ALERT
 

@@ -18,6 +18,7 @@ class Fault(IntEnum):
     LIDAR_GAPS = 106
     LIDAR_LATE = 107
     LIDAR_MISFIT = 108
+    LIDAR_TURNED = 109
     ADC_BUS_MISSING = 151
     ADC_BUS_REFUSED = 152
     ADC_MISSING = 153
@@ -42,6 +43,7 @@ class Fault(IntEnum):
     ODOMETRY_JUMPS = 202
     ODOMETRY_DISAGREES = 203
     ODOMETRY_GAPS = 204
+    ODOMETRY_SCALE = 205
     PROTECTION_ALERT = 251
     LOOP_STALLED = 301
     OVERRUNS = 302
@@ -82,6 +84,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "what the lidar measures does not fit the map where the robot must be, or anywhere after a start",
         "was the robot moved by hand, or does it drive where the map knows nothing yet? is the lidar covered, shifted "
         "on its mount, or does it measure wrongly?",
+    ),
+    Fault.LIDAR_TURNED: (
+        "the lidar is not mounted as configured",
+        "measure its mount, or record a drive and run `lumiloop calibrate --lidar-mount`; correct `lidar.mount`",
     ),
     Fault.ADC_BUS_MISSING: (
         "the photodiode's I2C bus is not there",
@@ -155,6 +161,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "odometry readings are lost, late, stamped late against the scans, or come more seldom than before",
         "check the network and the sender's load; send ten readings per second or more, at once and stamped when they "
         "were measured: does something on their way stamp them at arrival?",
+    ),
+    Fault.ODOMETRY_SCALE: (
+        "odometry is wrong by a constant factor or turns by itself; the pose is corrected for it",
+        "measure wheels and track, or record a drive and run `lumiloop calibrate --odometry`; correct its sender",
     ),
     Fault.PROTECTION_ALERT: (
         "the position error may be above the limit that is set, `integrity.alert_m`",

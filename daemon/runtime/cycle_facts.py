@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from daemon.health.faults import Fault
 from daemon.snapshot import CycleTiming, State
+from estimator import SlowErrors
 from hal.adc import AdcStatus
 from hal.lidar import LidarStatus
 
@@ -44,6 +45,7 @@ class CycleFacts:
         lidar: status of the driver, live. lidar_silent: scans have arrived before and do not arrive now.
         scans_dropped: not consumed by any cycle. scans_late: arrived late. scans_misfit: inconsistent with the map.
         lag_s: estimated delay of the lidar behind the odometry, s.
+        slow: lasting errors of odometry and lidar mount, None while none is large.
         odometry_ok: None where there is none. odometry_jumps: readings that no motion explains.
         odometry_disagrees: with the lidar. readings, readings_missed, readings_old: odometry readings that arrived,
         were
@@ -66,6 +68,7 @@ class CycleFacts:
     scans_late: int
     scans_misfit: bool
     lag_s: float
+    slow: SlowErrors | None
     odometry_ok: bool | None
     odometry_jumps: int
     odometry_disagrees: bool

@@ -31,6 +31,7 @@ def vitals(facts: CycleFacts, failed: set[str], lateness: float) -> Vitals:
         late=facts.scans_late,
         misfit=facts.scans_misfit,
         lag=facts.lag_s,
+        slow=facts.slow,
         readings=facts.readings,
         readings_missed=facts.readings_missed,
         readings_old=facts.readings_old,

@@ -60,9 +60,17 @@ K_FAULT: Final = ALIKE * math.sqrt(-2.0 * math.log(0.25 * RISK / FAULTY))
 
 
 def bound(
-    pose: MapPose, motion: Motion, light: LightChannel | None, matching: MatchMemory, P: Array
+    pose: MapPose,
+    motion: Motion,
+    light: LightChannel | None,
+    matching: MatchMemory,
+    P: Array,
+    mount_rad: float = 0.0,
 ) -> Protection | None:
-    """Protection level of the pose after this step, with its covariance ``P``; None if it is unavailable."""
+    """Protection level of the pose after this step; None if it is unavailable.
+
+    ``P``: its covariance. ``mount_rad``: largest heading error by the lidar mount, rad.
+    """
     alignment = pose.alignment
     laser = matching.local_map is not None and (motion.t_mono - matching.t_match < 1.0)
     lit = alignment is not None and alignment.placed and light is not None and light.result.fix is Fix.GOOD
@@ -73,7 +81,7 @@ def bound(
         assert light is not None
         for other in (_without_light(pose, motion, matching.steps), _without_laser(pose, motion, light)):
             horizontal, yaw = max(horizontal, other[0]), max(yaw, other[1])
-    horizontal, yaw = horizontal + UNKNOWN_M, min(yaw + UNKNOWN_RAD, math.pi)
+    horizontal, yaw = horizontal + UNKNOWN_M, min(yaw + UNKNOWN_RAD + mount_rad, math.pi)
     if not horizontal < MOST_M:
         return None
     return Protection(horizontal, yaw, laser, lit, motion.odometry)
