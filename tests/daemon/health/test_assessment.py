@@ -16,6 +16,7 @@ from daemon.health.present_faults import PresentFaults
 from daemon.health.report import NAMES
 from daemon.runtime import heartbeat as module
 from daemon.runtime.heartbeat import Heartbeat
+from estimator import SlowErrors
 from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused
 from hal.lidar import Link
 
@@ -80,6 +81,16 @@ def test_a_loop_that_is_late_while_kernels_are_compiled_is_no_fault() -> None:
     loading = Vitals(1.0, link=Link.STREAMING, lateness=0.5)
     assert assess(loading, loading) == ()
     assert assess(replace(WELL, lateness=0.5), BEFORE) == (Fault.LOOP_STALLED,)
+
+
+def test_large_errors_of_wheels_and_mount_are_named_with_their_values() -> None:
+    value, sigma = (-0.17, 0.02, 0.0, 0.1, 0.01), (0.01, 0.01, 0.002, 0.005, 0.01)
+    wheels = replace(WELL, slow=SlowErrors(value, sigma, (True, False, False, False, False)))
+    mount = replace(WELL, slow=SlowErrors(value, sigma, (False, False, False, True, False)))
+    assert assess(wheels, BEFORE) == (Fault.ODOMETRY_SCALE,)
+    assert "multiply its distances by 0.83 and its turns by 1.02" in describe(Fault.ODOMETRY_SCALE, wheels)
+    assert assess(mount, BEFORE) == (Fault.LIDAR_TURNED,)
+    assert "differs from `lidar.mount` by +5.7 deg (sigma 0.3)" in describe(Fault.LIDAR_TURNED, mount)
 
 
 def test_only_what_is_new_counts() -> None:
