@@ -196,15 +196,15 @@ class HokuyoDriver:
         rs232 = discover.is_rs232(device, self._baud)
         port = await self._opener(device, self._rate_found or self._baud or (BAUD_RATES[0] if rs232 else _USB_BAUD))
         session = Session(Line(port))
+        identity: Identity | None = None
         try:
             identity = await self._identify(session, rs232)
         except asyncio.CancelledError:
             await session.quiet()
-            session.line.close()
             raise
-        except HalError:
-            session.line.close()
-            raise
+        finally:
+            if identity is None:
+                session.line.close()
         self._geometry = identity.geometry
         self._describe(device, session, identity)
         return session

@@ -168,7 +168,7 @@ BYTES = [
     Case("what = 'stuck'; every = 3", None, "", Blemish.STUCK, blocks=150),
     Case("what = 'garbage'", DataInvalid, "bits it keeps at zero", Blemish.MISALIGNED, REOPEN),
     Case("what = 'garbage'; every = 3", None, "", Blemish.MISALIGNED, blocks=150),
-    Case("what = 'shift'", DataInvalid, "bits it keeps at zero", Blemish.MISALIGNED, REOPEN),
+    Case("what = 'shift'", DataInvalid, "bits it keeps at zero|without their highest bits", Blemish.MISALIGNED, REOPEN),
     Case("what = 'shift'; bits = 4; every = 5", None, "", Blemish.MISALIGNED, blocks=150),
     Case("what = 'hit'", None, "", Blemish.REPAIRED, blocks=150),
     Case("what = 'hit'; words = 15; mask = 0xffff", None, "", Blemish.REPAIRED, blocks=150),

@@ -200,13 +200,17 @@ class TestStopping:
 
         on_fake(body)
 
-    def test_during_every_wait_of_a_recovery(self) -> None:
+    @pytest.mark.parametrize("fault", ["silence", "stuck"])
+    def test_during_every_wait_of_a_recovery(self, fault: str) -> None:
         async def body(bench: Bench) -> None:
-            bench.order('[[fault]]\nwhat = "silence"')
+            bench.order(f'[[fault]]\nwhat = "{fault}"')
             for after in np.arange(0.05, 12.0, 0.37):
                 async with bench.running(bench.driver()):
                     await asyncio.sleep(float(after))
                     began = bench.clock.now()
                 assert bench.clock.now() - began <= 0.1001
+                await asyncio.sleep(0.01)
+                (await bench.opener(PORT, 0)).close()  # the port was given back
+                await asyncio.sleep(0.01)
 
         on_fake(body)
