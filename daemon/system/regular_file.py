@@ -30,7 +30,7 @@ def read_regular(path: Path, most: int) -> bytes:
     """
     _check(path.stat(), most)  # before the opening, which may start a device
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    with open(descriptor, "rb") as file:
+    with os.fdopen(descriptor, "rb") as file:
         _check(os.fstat(descriptor), most)
         content = bytearray()
         while piece := file.read(min(_PIECE, most + 1 - len(content))):  # files of /proc state no size

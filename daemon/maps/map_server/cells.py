@@ -65,7 +65,7 @@ def _within(path: Path, image: Path) -> Path:
     folder = path.parent.resolve()
     relative = Path(os.path.relpath(image, path.parent))
     inside = relative.parts[0] != os.pardir
-    named = folder / relative if inside else Path(os.path.abspath(image))
+    named = folder / relative if inside else Path(os.path.normpath(Path.cwd() / image))
     base = folder if inside else named.parent.resolve()
     try:
         found = named.resolve(strict=True)

@@ -315,7 +315,9 @@ class _Extent:
             at, character = self._at, text[self._at]
             self._at += 1
             if self._quote:
-                if (character == "\\" and self._quote == '"') or character == self._quote == "'" == text[at + 1 : at + 2]:
+                if (character == "\\" and self._quote == '"') or character == self._quote == "'" == text[
+                    at + 1 : at + 2
+                ]:
                     self._at += 1
                 elif character == self._quote:
                     self._quote = ""

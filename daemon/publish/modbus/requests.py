@@ -38,6 +38,7 @@ from daemon.publish.modbus import integrity_block, lights_block, parts_block, ti
 from daemon.publish.modbus.holding import Holding, Refused
 from daemon.publish.modbus.identification import READ_DEVICE_IDENTIFICATION, identify, objects_of
 from daemon.publish.modbus.registers import MIRROR_ADDRESS, MIRROR_WORDS
+from daemon.system.defects import Place, log_once
 
 HEADER_SIZE: Final = 7  # transaction, protocol, length, unit
 MAX_FRAME: Final = 260  # header and a body of at most 253 bytes
@@ -91,7 +92,7 @@ class Responder:
         self._block = b""
         self._make: tuple[Make, ...] = ()
         self._made: dict[int, bytes] = {}
-        self._told = ""
+        self._defects: set[Place] = set()
 
     def show(self, block: bytes, *beside: Make) -> None:
         """Replace all blocks at once: no reply ever mixes two snapshots.
@@ -143,15 +144,9 @@ class Responder:
         except (ValueError, IndexError, struct.error, ModbusException):
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
         except Exception as error:  # noqa: BLE001  any failure is reported to the client and logged
-            self._failed(error)
+            log_once(log, self._defects, error, "a Modbus request cannot be answered; its client is told exception 4")
             return ExceptionResponse(function, ExcCodes.DEVICE_FAILURE)
         return ExceptionResponse(function, ExcCodes.ILLEGAL_FUNCTION)
-
-    def _failed(self, error: Exception) -> None:
-        """Log a defect with its traceback; once, because clients repeat their requests."""
-        if repr(error) != self._told:
-            self._told = repr(error)
-            log.error("a Modbus request cannot be answered; its client is told exception 4", exc_info=error)
 
     def _read(self, function: int, body: bytes) -> ModbusPDU:
         holding = function == READ_HOLDING

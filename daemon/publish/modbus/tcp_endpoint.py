@@ -10,6 +10,7 @@ from typing import Final
 
 from daemon.publish.modbus.counts import CROWDED, GREEDY, MAX_CONNECTIONS, STRANGE, Allowed, Counts, everyone
 from daemon.publish.modbus.requests import Responder, frame_size
+from daemon.system.defects import Place, log_once
 from hal.net.fair_share import Share
 from hal.net.peers import full_for, host_of, largest
 
@@ -143,6 +144,7 @@ class TcpEndpoint:
         self._connections: dict[Connection, None] = {}
         self._waiting: deque[Connection] = deque()
         self._servers: list[asyncio.Server] = []
+        self._defects: set[Place] = set()
         self._again: asyncio.TimerHandle | None = None
         self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
 
@@ -227,8 +229,8 @@ class TcpEndpoint:
         """As :meth:`Connection.serve`; a connection that fails is closed, and the others are still served."""
         try:
             return connection.serve(most)
-        except Exception:
-            log.exception("a Modbus client cannot be served; it is disconnected")
+        except Exception as error:  # noqa: BLE001  any failure closes this connection alone
+            log_once(log, self._defects, error, "a Modbus client cannot be served; it is disconnected")
             connection.abort()
             return False
 
