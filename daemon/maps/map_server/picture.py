@@ -7,9 +7,10 @@ import re
 import struct
 import warnings
 import zlib
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from daemon.maps.map_server.pixels import BadPicture, Picture, check_size
 from daemon.maps.map_server.png_reader import chunks_of, read_png
@@ -49,7 +50,7 @@ def read_picture(data: bytes, most: int) -> Picture:
     if png:
         chunks_of(data)  # its checksums
     try:
-        from PIL import Image
+        from PIL import Image, UnidentifiedImageError
     except ImportError:
         if png:
             return read_png(data)
@@ -61,7 +62,7 @@ def read_picture(data: bytes, most: int) -> Picture:
             with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
                 check_size(*image.size, most)
                 return _converted(image)
-    except (Image.UnidentifiedImageError, Image.DecompressionBombError):
+    except (UnidentifiedImageError, Image.DecompressionBombError):
         raise BadPicture("is neither PGM, PNG, BMP, JPEG, TIFF nor GIF of a usable size; convert it to one") from None
     except _DAMAGED as error:
         raise BadPicture(f"cannot be decoded ({error}); copy it again") from None
@@ -95,17 +96,19 @@ def _pgm(data: bytes, most: int) -> Picture:
     values = values[:count]
     if values.min() < 0 or values.max() > largest:
         raise BadPicture(f"has values beyond its largest one, {largest}; export it again")
-    kind = np.uint8 if largest < 256 else np.uint16
-    return Picture(values.astype(kind, copy=False).reshape(rows, columns, 1), largest)
+    values = values.reshape(rows, columns, 1)
+    if largest < 256:
+        return Picture(values.astype(np.uint8, copy=False), largest)
+    return Picture(values.astype(np.uint16, copy=False), largest)
 
 
-def _bytes(data: bytes, largest: int) -> np.ndarray:
+def _bytes(data: bytes, largest: int) -> npt.NDArray[Any]:
     if largest < 256:
         return np.frombuffer(data, np.uint8)
     return np.frombuffer(data[: len(data) // 2 * 2], ">u2")
 
 
-def _decimals(data: bytes, count: int) -> np.ndarray:
+def _decimals(data: bytes, count: int) -> npt.NDArray[Any]:
     """Whole numbers in text, up to ``count`` of them."""
     text = re.sub(rb"#[^\n]*", b"", data)
     if text.translate(None, b"0123456789 \t\n\r\v\f"):
