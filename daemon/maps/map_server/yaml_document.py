@@ -193,7 +193,9 @@ class _Parser:
         if begin in ("[", "{"):
             node = self._flow_collection(cursor, begin, depth)
         elif begin in ("'", '"'):
-            node = _unquoted(cursor.take(_Extent().end(cursor.rest())))
+            if (size := _Extent().end(cursor.rest())) < 0:
+                raise self._bad("begins the quoted text that has no end", self._at - 1)
+            node = _unquoted(cursor.take(size))
         else:
             plain = re.match(r"(?:[^,\[\]{}:]|:(?![\s,\[\]{}]|$))*", cursor.rest())
             text = " ".join((cursor.take(plain.end()) if plain else "").split())

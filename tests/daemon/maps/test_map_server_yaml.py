@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from daemon.maps.map_server import BadMapServer, describe
@@ -137,6 +137,7 @@ def test_collections_within_one_another_have_a_limit() -> None:
         parse("a: " + "[" * (DEEPEST + 1) + "]" * (DEEPEST + 1))
 
 
+@example('[:.! "bx\n,\'~.~:x*a-"|{ ,*|.!-}\\]\na')
 @given(st.text(alphabet="ab:-[]{},'\"#&*!|>%\\ \n\t~?x0.", max_size=80))
 def test_no_text_does_more_than_be_refused(text: str) -> None:
     with contextlib.suppress(BadYaml):

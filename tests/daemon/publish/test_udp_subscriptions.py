@@ -211,7 +211,7 @@ async def test_a_stranger_gets_no_answer_and_a_gone_network_is_counted() -> None
 async def test_a_lease_runs_out_without_a_word() -> None:
     server = Subscriptions("127.0.0.1", 0, lambda _: True)
     await server.start()
-    subscribe(server.leases, asyncio.get_running_loop().time(), lease=5, peer=(("127.0.0.1", 9), ()))
+    subscribe(server.leases, asyncio.get_running_loop().time(), lease=5, peer=("127.0.0.1", 9))
     for _ in range(60):
         server.send(b"data")
         await asyncio.sleep(0.1)
