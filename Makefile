@@ -124,7 +124,7 @@ uninstall:  ## remove that; configuration and maps stay unless PURGE=1
 deb:  ## the same as a Debian package, in out/
 	systemd/package.sh
 
-EXTRAS  := --extra plot --extra mcap --extra foxglove --extra view --extra zenoh
+EXTRAS  := --extra plot --extra images --extra mcap --extra foxglove --extra view --extra zenoh
 COMPILE := uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --no-strip-extras --quiet --upgrade
 lock:  ## renew the lock files (needs uv)
 	$(COMPILE) pyproject.toml -o requirements/core.lock

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from daemon.system.console import OK, USAGE, fail, say
 from daemon.system.extras import how_to_install
+from daemon.system.logging import start_command_log
 
 OURS = ("daemon", "estimator", "hal", "taps")
 
@@ -98,6 +99,7 @@ def needing(extra: str, module: str, name: str) -> Body:
             if missing in OURS:
                 raise
             return fail(f"this command needs {missing}, which is not installed: {how_to_install(extra)}")
+        start_command_log()
         return loaded(module, name)(args)
 
     return configured(body)

@@ -45,6 +45,13 @@ def _metrics(parser: argparse.ArgumentParser) -> None:
 
 def _foxglove(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", default="127.0.0.1:8765", metavar="HOST:PORT", help="default: 127.0.0.1:8765")
+    parser.add_argument(
+        "--origin",
+        action="append",
+        default=[],
+        metavar="URL",
+        help="a web app that may connect, as https://app.example; Foxglove's own and installed apps always may",
+    )
     listening(parser)
     parser.set_defaults(body=needing("foxglove", "taps.foxglove.live", "main"))
 

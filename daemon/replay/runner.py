@@ -344,7 +344,6 @@ class Rerun:
         self._kept.append(record)
         if self.watch is not None:
             self.watch(record)
-        rows = len(self.ledger)
-        self.ledger.add(record, *self._latest)
+        row = self.ledger.add(record, *self._latest)
         if self._journal is not None:
-            self._journal.gave(rows if len(self.ledger) > rows else None)
+            self._journal.gave(row)

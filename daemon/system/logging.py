@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from daemon.system.defects import TracebackLimit
+
 JOURNAL: Final = Path("/run/systemd/journal/socket")
 TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
 PRIORITY: Final = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
@@ -53,7 +55,16 @@ def start_log() -> None:
         handler.setFormatter(_PriorityFormat("%(message)s"))
         handler = JournalHandler(JOURNAL, handler)
         handler.setFormatter(logging.Formatter("%(message)s"))
+    handler.addFilter(TracebackLimit())
     logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+def start_command_log() -> None:
+    """Start logging of a command beside the daemon: warnings to stderr, as its other messages."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("lumiloop: %(message)s"))
+    handler.addFilter(TracebackLimit())
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
 
 
 def to_journal() -> bool:

@@ -102,7 +102,7 @@ def _export(args: argparse.Namespace) -> int:
             stopped = _run(source, translator, file)
             _draw(source, translator, file)
         console.say(f"{args.mcap}: {file.messages} messages")
-    final = source.rerun.ledger.online() if args.online else source.rerun.ledger.final()
+    final = (source.rerun.ledger.online() if args.online else source.rerun.ledger.final()).ordered()
     guesses = sum(map(bool, final.guesses()))
     guessed = f", and {guesses} guesses that are none" if guesses else ""
     for path, text in ((args.tum, tum), (args.kitti, kitti)):

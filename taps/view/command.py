@@ -6,7 +6,6 @@ import argparse
 import asyncio
 import contextlib
 import errno
-import logging
 import multiprocessing
 import os
 import socket
@@ -139,7 +138,6 @@ def _wait(film: ReplayFile) -> None:
 
 def _serve(view: View, guard: Guard, port: int, what: str) -> int:
     """Serve until interrupted."""
-    logging.basicConfig(level=logging.WARNING, format="lumiloop: %(message)s")
     try:
         asyncio.run(_until_signal(view, guard, port, what))
     except OSError as error:
@@ -151,7 +149,7 @@ def _serve(view: View, guard: Guard, port: int, what: str) -> int:
 
 async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
     stop = stop_event()
-    runner = web.AppRunner(view.app(), access_log=None, shutdown_timeout=1.0)
+    runner = view.runner()
     await runner.setup()
     try:
         site = web.TCPSite(runner, guard.bind, port)

@@ -281,3 +281,13 @@ def test_a_place_that_cannot_be_written_is_named(
     assert parser.main(["map", "name", str(file), "hall", "--out", str(out)]) == console.FAILED
     said = capsys.readouterr().err
     assert f"{out}: cannot be written: No such file or directory; name another place with --out FILE" in said
+
+
+def test_a_drawing_of_more_floor_than_can_be_imported_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.fromarray(np.full((250, 250), 254, np.uint8)).save(tmp_path / "map.pgm")
+    (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 1.0\norigin: [0, 0, 0]\n")
+    assert run("import", tmp_path / "map.yaml", "--out", tmp_path / "new.lumimap") == console.FAILED
+    assert "has 62500 m2 of free floor; at most 50000 can be imported" in capsys.readouterr().err
+    assert not (tmp_path / "new.lumimap").exists()
