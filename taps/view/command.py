@@ -29,6 +29,7 @@ from daemon.publish.modbus.client import NoAnswer
 from daemon.publish.stream.client import Stream
 from daemon.system import console
 from daemon.system.logging import to_journal
+from daemon.system.traceback_limit import limit_tracebacks
 from hal.run_server import stop_event
 from taps.access_guard import Guard, TokenRefused, token_for
 from taps.view.page_hello import Scene, SceneUnreadable, scene_of
@@ -140,6 +141,7 @@ def _wait(film: ReplayFile) -> None:
 def _serve(view: View, guard: Guard, port: int, what: str) -> int:
     """Serve until interrupted."""
     logging.basicConfig(level=logging.WARNING, format="lumiloop: %(message)s")
+    limit_tracebacks()
     try:
         asyncio.run(_until_signal(view, guard, port, what))
     except OSError as error:

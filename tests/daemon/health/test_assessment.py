@@ -49,8 +49,8 @@ def test_all_is_well() -> None:
         ({"odometry": True, "readings": 100, "readings_old": 20}, Fault.ODOMETRY_GAPS),
         ({"odometry": True, "readings": 100, "readings_seldom": True}, Fault.ODOMETRY_GAPS),
         ({"lateness": 0.21}, Fault.LOOP_STALLED),
-        ({"overruns": 30}, Fault.OVERRUNS),
         ({"jobs_failed": 1}, Fault.WORKER_FAILED),
+        ({"no_descriptors": True}, Fault.NO_DESCRIPTORS),
         ({"failed": frozenset(["modbus"])}, Fault.PUBLISHER_FAILED),
         ({"failed": frozenset(["publisher"])}, Fault.PUBLISHER_FAILED),
         *(({"failed": frozenset([part])}, Fault.PART_FAILED) for part in sorted(INPUTS | {"stream beat"})),
@@ -90,7 +90,8 @@ def test_only_what_is_new_counts() -> None:
 
 def test_the_gravest_comes_first() -> None:
     now = replace(WELL, overruns=100, invalid=100, failed=frozenset(["pose"]))
-    assert assess(now, BEFORE) == (Fault.LIDAR_GARBLED, Fault.OVERRUNS, Fault.PUBLISHER_FAILED)
+    slow = (Fault.COMPUTER_SLOW, Fault.OVERRUNS)
+    assert assess(now, BEFORE) == (Fault.LIDAR_GARBLED, *slow, Fault.PUBLISHER_FAILED)
 
 
 def test_missing_scans_of_a_lidar_that_is_down_are_no_fault_of_their_own() -> None:
@@ -347,7 +348,10 @@ async def test_a_beat_that_fails_is_said_once_and_feeds_no_watchdog_and_the_next
 def test_cycles_that_leave_out_map_work_or_laser_are_a_fault_while_they_are_many() -> None:
     before = Vitals(0.0, cycles=400, short=10)
     many, few = replace(before, t_mono=10.0, cycles=800, short=60), replace(before, t_mono=10.0, cycles=800, short=20)
-    assert assess(replace(many, link=Link.STREAMING), replace(before, link=Link.STREAMING)) == (Fault.OVERLOADED,)
+    assert assess(replace(many, link=Link.STREAMING), replace(before, link=Link.STREAMING)) == (
+        Fault.COMPUTER_SLOW,
+        Fault.OVERLOADED,
+    )
     assert assess(replace(few, link=Link.STREAMING), replace(before, link=Link.STREAMING)) == ()
 
 
