@@ -56,7 +56,7 @@ def start_log() -> None:
         handler = JournalHandler(JOURNAL, handler)
         handler.setFormatter(logging.Formatter("%(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
-    limit_tracebacks()
+    limit_tracebacks(handler)
 
 
 def to_journal() -> bool:

@@ -98,16 +98,17 @@ _LIMIT: Final = TracebackLimit()
 """That of this process."""
 
 
-def limit_tracebacks() -> None:
-    """Limit the tracebacks of every log line, and of errors in threads and finalisers. Idempotent.
+def limit_tracebacks(handler: logging.Handler | None = logging.lastResort) -> None:
+    """Limit the tracebacks of a log handler of this process, and of errors in threads and finalisers. Idempotent.
 
-    Call it after the log handlers have been set.
+    Default: the handler of a process that sets none.
     """
-    for handler in (*logging.root.handlers, logging.lastResort):
-        if handler is not None and _LIMIT not in handler.filters:
-            handler.addFilter(_LIMIT)
-    threading.excepthook = _in_thread
-    sys.unraisablehook = _in_finaliser
+    if handler is not None:
+        handler.addFilter(_LIMIT)
+    if threading.excepthook is threading.__excepthook__:
+        threading.excepthook = _in_thread
+    if sys.unraisablehook is sys.__unraisablehook__:
+        sys.unraisablehook = _in_finaliser
 
 
 def _in_thread(args: threading.ExceptHookArgs) -> None:

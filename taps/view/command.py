@@ -140,8 +140,9 @@ def _wait(film: ReplayFile) -> None:
 
 def _serve(view: View, guard: Guard, port: int, what: str) -> int:
     """Serve until interrupted."""
-    logging.basicConfig(level=logging.WARNING, format="lumiloop: %(message)s")
-    limit_tracebacks()
+    handler = logging.StreamHandler()
+    limit_tracebacks(handler)
+    logging.basicConfig(level=logging.WARNING, format="lumiloop: %(message)s", handlers=[handler])
     try:
         asyncio.run(_until_signal(view, guard, port, what))
     except OSError as error:

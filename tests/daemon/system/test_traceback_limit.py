@@ -9,7 +9,6 @@ import io
 import logging
 import sys
 import threading
-from collections.abc import Iterator
 
 import pytest
 
@@ -94,19 +93,16 @@ def test_kinds_that_are_remembered_are_bounded() -> None:
 
 
 @pytest.fixture
-def limited(monkeypatch: pytest.MonkeyPatch) -> Iterator[io.StringIO]:
+def limited(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     """The process's own log, with a fresh limit, and its text."""
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)
     monkeypatch.setattr(traceback_limit, "_LIMIT", TracebackLimit())
-    monkeypatch.setattr(threading, "excepthook", threading.excepthook)
-    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    monkeypatch.setattr(threading, "excepthook", threading.__excepthook__)
+    monkeypatch.setattr(sys, "unraisablehook", sys.__unraisablehook__)
     monkeypatch.setattr(logging.root, "handlers", [handler])
-    traceback_limit.limit_tracebacks()
-    yield stream
-    for each in (handler, logging.lastResort):
-        if each is not None:
-            each.removeFilter(traceback_limit._LIMIT)
+    traceback_limit.limit_tracebacks(handler)
+    return stream
 
 
 def test_callbacks_of_the_loop_threads_and_finalisers_are_limited(limited: io.StringIO) -> None:
