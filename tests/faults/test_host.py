@@ -165,7 +165,7 @@ def steady(daemon: Running, seconds: float = 3.0) -> None:
 def no_descriptors(daemon: Running, _disk: Path) -> None:
     """The limit is lowered to what is open and a few more; then clients take those."""
     pid, before = daemon.process.pid, resource.prlimit(daemon.process.pid, resource.RLIMIT_NOFILE)
-    limit = max(int(number) for number in os.listdir(f"/proc/{pid}/fd")) + 12
+    limit = max(int(file.name) for file in Path(f"/proc/{pid}/fd").iterdir()) + 12
     resource.prlimit(pid, resource.RLIMIT_NOFILE, (limit, before[1]))
     with contextlib.ExitStack() as lines:
         for _ in range(20):
