@@ -57,7 +57,8 @@ def judge(report: pytest.TestReport, pace: Pace | None) -> None:
     if reason:
         report.outcome = "skipped"
         path, line, _ = report.location
-        report.longrepr = (path, line or 0, f"Skipped: {reason}; failed with: {report.longreprtext[-300:]}")
+        failure = next((text for text in report.longreprtext.splitlines() if text.startswith("E ")), "")
+        report.longrepr = (path, line or 0, f"Skipped: {reason}; {failure[1:].strip()[:200]}")
 
 
 def runnable(source: Path = LOADAVG) -> int | None:
