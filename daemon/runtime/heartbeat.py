@@ -128,7 +128,7 @@ class Heartbeat:
     def _tell(self, now: Vitals, faults: tuple[Fault, ...]) -> None:
         """Logs each fault once when it appears, in its device's own words, and once when it is over.
 
-        A consequence of another fault is logged below its cause, and its end not at all. If it outlasts its cause, it
+        A consequence of another fault is logged below its cause, once as long as that lasts, and its end not at all. If it outlasts its cause, it
         is logged as a fault of its own.
         """
         for fault in faults:
@@ -138,7 +138,7 @@ class Heartbeat:
                 seen = self._seen[fault] = _Seen(now.t_mono, now.t_mono, cause)
             seen.last = now.t_mono
         for fault, seen in list(self._seen.items()):
-            if now.t_mono - seen.last >= OVER_S:
+            if now.t_mono - seen.last >= OVER_S and (seen.cause is Fault.NONE or seen.cause not in faults):
                 del self._seen[fault]
                 if seen.cause is Fault.NONE:
                     lasted = seen.last - seen.begun + BEAT_S

@@ -53,16 +53,16 @@ class Watch:
         return "  ".join(f"{name} {value:.4g}" for name, value in named)
 
     def figures(self, command: str) -> list[Figure]:
-        """Slopes by least squares, and the least and most of what must not change, after the run has settled."""
+        """Slopes by least squares, and the growth of what must not grow, after the run has settled."""
         hours = self.column("hours")
         after = hours >= SETTLED * hours[-1]
         slope = {name: float(np.polyfit(hours[after], self.column(name)[after], 1)[0]) for name in ROWS}
-        spread = {name: float(np.ptp(self.column(name)[after])) for name in ("descriptors", "threads")}
+        grown = {name: growth(self.column(name)[after]) for name in ("descriptors", "threads")}
         cycle = slope["median_ms"] / float(np.median(self.column("median_ms")[after]))
         rows = [Figure("hours", float(hours[-1]), "h", command=command)]
         rows.append(bounded("memory, slope", slope["resident_mb"], "MB/h", f"<= {SLOPE_MB_H:g}", command))
         rows.append(Figure("memory at the end", float(self.column("resident_mb")[-1]), "MB", command=command))
-        rows += [bounded(f"{name}, most less least", spread[name], "", "<= 0", command) for name in spread]
+        rows += [bounded(f"{name}, growth", grown[name], "", "<= 0", command) for name in grown]
         rows += [Figure(f"{name}, slope", slope[name], f"{unit}/h", command=command) for name, unit in _STORED]
         rows.append(bounded("cycle, slope of the median", cycle, "1/h", f"<= {CYCLE_SLOPE_PER_H:g}", command))
         rows += [
@@ -72,8 +72,8 @@ class Watch:
         kept = np.array(self.kept)
         for name, column in zip(KEPT, kept.T if kept.size else (), strict=False):
             rows.append(Figure(f"{name} at the end", float(column[-1]), "", command=command))
-            grown = float(np.polyfit(hours[after], column[after], 1)[0])
-            rows.append(Figure(f"{name}, slope", grown, "1/h", command=command))
+            per_hour = float(np.polyfit(hours[after], column[after], 1)[0])
+            rows.append(Figure(f"{name}, slope", per_hour, "1/h", command=command))
         return rows
 
     def draw(self, path: Path) -> None:
@@ -101,6 +101,12 @@ class Watch:
 
 
 _STORED: Final = (("stored_files", "1"), ("stored_mb", "MB"))
+
+
+def growth(counts: Array) -> float:
+    """Median of the last third less that of the first: a file that is open for a moment is no growth."""
+    third = max(1, len(counts) // 3)
+    return float(np.median(counts[-third:]) - np.median(counts[:third]))
 
 
 def stored(folder: Path | None) -> tuple[float, float]:

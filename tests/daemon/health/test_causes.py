@@ -121,6 +121,17 @@ def test_the_log_has_one_warning_and_one_end_for_all_that_a_slow_computer_brings
     assert heart.faults == ()
 
 
+def test_a_consequence_that_comes_and_goes_has_one_line_as_long_as_its_cause_lasts(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    heart = Heartbeat(lambda lateness: WELL, str)
+    for second in range(60):
+        late = (Fault.OVERRUNS,) if second % 10 == 0 else ()
+        heart._tell(Vitals(float(second)), (Fault.COMPUTER_SLOW, *late))
+    assert [text.split(":")[0] for text in caplog.messages] == ["fault 306", "fault 302 follows from fault 306"]
+
+
 def test_what_outlasts_its_cause_is_named_for_itself(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     heart = Heartbeat(lambda lateness: WELL, str)
