@@ -128,8 +128,8 @@ class Heartbeat:
     def _tell(self, now: Vitals, faults: tuple[Fault, ...]) -> None:
         """Logs each fault once when it appears, in its device's own words, and once when it is over.
 
-        A consequence of another fault is logged below its cause, once as long as that lasts, and its end not at all. If it outlasts its cause, it
-        is logged as a fault of its own.
+        A consequence of another fault is logged below its cause, once as long as that lasts, and its end not at all.
+        If it outlasts its cause, it is logged as a fault of its own.
         """
         for fault in faults:
             seen, cause = self._seen.get(fault), Fault(cause_of(fault, faults))
