@@ -47,10 +47,12 @@ from daemon.runtime.inbox import Inbox
 from daemon.runtime.scheduler import Pacemaker
 from daemon.runtime.snapshot_builder import SnapshotBuilder
 from daemon.runtime.stage_times import StageTimer
-from daemon.runtime.vitals import process_age_s, resident_mb, statistics, vitals
+from daemon.runtime.vitals import ProcessFacts, process_age_s, resident_mb, statistics, vitals
 from daemon.runtime.warmup import Warmth
 from daemon.runtime.worker import ThreadWorker, Worker
 from daemon.snapshot import Snapshot, State, Thread
+from daemon.system.descriptors import used_up
+from daemon.system.processor_wait import ProcessorWait
 from daemon.system.realtime import claim, line_up
 from daemon.system.sd_notify import notify
 from estimator import Command, Order
@@ -90,6 +92,7 @@ class Daemon:
         self._environment, self._recorder = environment, recorder
         clock = environment.clock
         self._begun = clock.now()
+        self._wait = ProcessorWait()
         lights = environment.lights or load_lights(settings)
 
         opener = environment.opener if recorder is None else recorder.tap(environment.opener)
@@ -189,6 +192,7 @@ class Daemon:
             for kept in (self.last_pose, self._environment.sample_clock):
                 if kept is not None:
                     kept.close()
+            self._wait.close()
             await saving
             if self._recorder is not None:
                 self._recorder.close(ended=stop.is_set())
@@ -347,7 +351,13 @@ class Daemon:
             failed.add("stored map")
         if self.threads.look() - {Thread.I2C}:  # the bus has faults of its own
             failed.add("thread")
-        return vitals(self.cycle.facts(), failed, max(lateness, self.pacemaker.latest()))
+        return vitals(self.cycle.facts(), failed, self._process(max(lateness, self.pacemaker.latest())))
+
+    def _process(self, lateness: float) -> ProcessFacts:
+        """Facts on the process; in virtual time nothing but the delay, because the processor does not count there."""
+        if self._environment.stopwatch is None:
+            return ProcessFacts(lateness)
+        return ProcessFacts(lateness, self._wait.seconds() or 0.0, used_up())
 
 
 class _FirstPose:

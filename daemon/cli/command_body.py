@@ -50,9 +50,13 @@ def estimating(module: str, name: str, what: str = "warm") -> Body:
 
 
 def loaded(module: str, name: str) -> Body:
-    """Returns a body that loads its module when it runs."""
+    """Returns a body that loads its module when it runs. What serves clients (`taps`) has a limit of tracebacks."""
 
     def body(args: argparse.Namespace) -> int:
+        if module.startswith("taps."):
+            from daemon.system.traceback_limit import limit_tracebacks
+
+            limit_tracebacks()
         run: Body = getattr(import_module(module), name)
         return run(args)
 

@@ -309,7 +309,10 @@ def daemon(case: Case) -> Iterator[Finding]:
         return
     present = () if heard.faults is None else heard.faults.present
     for fault in present:
-        yield fix("daemon", f"fault {fault.fault}: {fault.meaning}", fault.remedy)
+        if fault.cause:
+            yield remark("daemon", f"fault {fault.fault} follows from fault {fault.cause}: {fault.meaning}")
+        else:
+            yield fix("daemon", f"fault {fault.fault}: {fault.meaning}", fault.remedy)
     if heard.pose is None:
         yield fix("daemon", f"{heard.name} runs, and tells no pose", "it is starting, or it stands; see its log")
     elif heard.pose.state in (State.TRACKING, State.MAPPING):

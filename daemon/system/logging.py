@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from daemon.system.defects import TracebackLimit
+from daemon.system.traceback_limit import limit_tracebacks
 
 JOURNAL: Final = Path("/run/systemd/journal/socket")
 TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
@@ -55,16 +55,16 @@ def start_log() -> None:
         handler.setFormatter(_PriorityFormat("%(message)s"))
         handler = JournalHandler(JOURNAL, handler)
         handler.setFormatter(logging.Formatter("%(message)s"))
-    handler.addFilter(TracebackLimit())
     logging.basicConfig(level=logging.INFO, handlers=[handler])
+    limit_tracebacks(handler)
 
 
 def start_command_log() -> None:
     """Start logging of a command beside the daemon: warnings to stderr, as its other messages."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("lumiloop: %(message)s"))
-    handler.addFilter(TracebackLimit())
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    limit_tracebacks(handler)
 
 
 def to_journal() -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 
 from daemon.config.schema import Mount
 from daemon.publish.stream.messages import (
+    Fault,
     Faults,
     Frame,
     Lights,
@@ -335,7 +336,7 @@ class Translator:
         text = f"{frame.state_name}: {frame.meaning}" if frame.meaning else frame.state_name
         found = [_status(level, "state", text, {"remedy": frame.remedy, "jumps": frame.jumps, "map": frame.map_id})]
         present = () if self._faults is None else self._faults.present
-        found += [_status(ERROR, f"fault {one.fault}", one.meaning, {"remedy": one.remedy}) for one in present]
+        found += [_of_fault(one) for one in present]
         pulse = frame.pulse
         if pulse is not None:
             late = {"rung": pulse.rung, "stalls": pulse.stalls, "overruns": frame.overruns, "cycle_us": frame.cycle_us}
@@ -347,6 +348,12 @@ class Translator:
             lights = {"in view": len(self._lights.links), "blocks": self._lights.blocks}
             found.append(_status(OK, "lights", f"{self._lights.used} used", lights))
         return found
+
+
+def _of_fault(fault: Fault) -> Any:
+    """A fault; one that follows from another is a warning, because its cause is the error."""
+    values = {"remedy": fault.remedy} | ({"cause": fault.cause} if fault.cause else {})
+    return _status(WARN if fault.cause else ERROR, f"fault {fault.fault}", fault.meaning, values)
 
 
 def _status(level: int, name: str, message: str, values: dict[str, Any]) -> Any:

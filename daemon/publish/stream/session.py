@@ -35,7 +35,7 @@ LATEST: Final = {
 ONCE: Final = {
     "state": "at first and at a change: state and reason, with meaning and remedy",
     "loop": "a loop closed: counter, both keyframes, residual, reason",
-    "faults": "at first and at a change: all that are present, with meaning and remedy",
+    "faults": "at first and at a change: all that are present, with meaning, remedy and cause",
 }
 """Topics of which a client receives every message, up to :data:`KEPT`."""
 RAW: Final = {"raw": "what passes between daemon and devices: bytes of the lidar's port, words of the photodiode"}

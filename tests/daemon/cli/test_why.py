@@ -119,8 +119,7 @@ def test_a_fault_that_is_over_is_told_too(recorded: Path, capsys: pytest.Capture
     (ring,) = (path for path in recorded.iterdir() if not path.name.startswith(DUMP))
     changes = asked("2023-11-14T22:13:38Z", ring, capsys).splitlines()
     (over,) = (line.split()[0] for line in changes if "fault 101 is over" in line)  # the attempts to open decide when
-    second = datetime.strptime(f"2023-11-14 {over} {ZONE}", "%Y-%m-%d %H:%M:%S.%f %z").astimezone(UTC)
-    said = asked(f"{second:%Y-%m-%dT%H:%M:%SZ}", ring, capsys)
+    said = asked(f"2023-11-14T22:13:{over[6:8]}Z", ring, capsys)
     assert "state, reason or faults first change in it" in said.splitlines()[0]
     assert "fault 101 since" not in said
     assert "fault 101 is over: the lidar is not there" in said

@@ -367,3 +367,13 @@ def test_a_lamp_in_a_passing_shadow_is_nothing_to_fix(file: Path, capsys: pytest
     said = capsys.readouterr().out
     assert not re.search(r"FIX +lamps", said)
     assert "at this moment" in said
+
+
+def test_what_follows_from_a_fault_is_no_second_thing_to_fix(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    slow = Fault(fault=306, meaning="too slow", remedy="take load off")
+    stalled = Fault(fault=301, meaning="stalled", remedy="take load off", cause=306)
+    asked(file, Computer(heard=Heard("agv", 7, POSE, Faults(present=(slow, stalled)))))
+    said = capsys.readouterr().out
+    assert re.search(r"FIX +daemon +fault 306: too slow", said)
+    assert re.search(r"note +daemon +fault 301 follows from fault 306: stalled", said)
+    assert said.count("take load off") == 1 + said.endswith("daemon: take load off\n")

@@ -323,7 +323,7 @@ async def test_the_reference_client_reads_it(tmp_path: Path) -> None:
     async with running(tmp_path / "stream") as server:
         command = [str(ROOT / "tools/clients/watch_stream.py"), str(server.path), "pose", "scan", "state", "faults"]
         server.publish(SNAPSHOT)
-        server.on_faults(1.0, [(104, "no valid scan", "check the cable")])
+        server.on_faults(1.0, [(104, "no valid scan", "check the cable", 0)])
         process = await asyncio.create_subprocess_exec(sys.executable, *command, stdout=asyncio.subprocess.PIPE)
         assert process.stdout is not None
         hello = await asyncio.wait_for(process.stdout.readline(), 10.0)
