@@ -12,7 +12,7 @@ import numpy.typing as npt
 from daemon.maps.map_server.description import BadMapServer, Description, describe
 from daemon.maps.map_server.picture import read_picture
 from daemon.maps.map_server.pixels import BadPicture, Picture
-from daemon.system.regular_file import FileRefused, read_regular
+from daemon.system.bounded_file import FileRefused, read_regular
 
 Trinary = npt.NDArray[np.int8]
 """(rows, columns), row 0 at the bottom: 1 occupied, 0 free, -1 unknown."""

@@ -16,7 +16,7 @@ from PIL import Image
 from daemon.maps.map_server import BadMapServer, load, png_reader
 from daemon.maps.map_server.picture import read_picture
 from daemon.maps.map_server.pixels import BadPicture
-from daemon.system.regular_file import FileRefused, read_regular
+from daemon.system.bounded_file import FileRefused, read_regular
 
 GREYS = np.array([[0, 254, 205], [100, 88, 255]], np.uint8)
 CELLS = [[-1, 1, 0], [1, 0, -1]]
