@@ -70,13 +70,17 @@ def note_damage(path: str, reason: str) -> None:
 
 def _content(path: str) -> bytes:
     """Bytes of a regular file; a FIFO or a device without a writer never blocks."""
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        about = os.fstat(file.fileno())
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        about = os.fstat(handle)
         if not stat.S_ISREG(about.st_mode):
             raise _Unusable("it is no regular file")
         if about.st_size > MOST_BYTES:
             raise _Unusable(f"it has {about.st_size} bytes")
-        return file.read(MOST_BYTES)
+        with os.fdopen(handle, "rb", closefd=False) as file:
+            return file.read(MOST_BYTES)
+    finally:
+        os.close(handle)
 
 
 def _checked(content: bytes) -> bytes:
