@@ -124,7 +124,7 @@ class _CheckedFile(_upstream.IndexDataCacheFile):  # type: ignore[misc]  # untyp
 
     def _load_index(self) -> dict[Any, str]:
         found = _unpacked(self._index_path)
-        if found is None or found[:2] != (self._version, self._source_stamp):
+        if not isinstance(found, tuple) or found[:2] != (self._version, self._source_stamp):
             return {}
         return dict(found[2])
 
@@ -136,8 +136,17 @@ class _CheckedFile(_upstream.IndexDataCacheFile):  # type: ignore[misc]  # untyp
 
 
 def _unpacked(path: str) -> Any:
+    """Object in a cache file; None if the file is missing or, with an entry in the report, unusable."""
     content = read_checked(path)
-    return None if content is None else pickle.loads(content)
+    if content is None:
+        return None
+    try:
+        return pickle.loads(content)
+    except MemoryError:
+        raise
+    except Exception as error:  # noqa: BLE001  a pickle may raise anything
+        note_damage(path, repr(error))
+        return None
 
 
 class _Locator(_upstream.UserProvidedCacheLocator):  # type: ignore[misc]  # untyped upstream
