@@ -135,16 +135,22 @@ def test_a_start_whose_kernels_are_there_waits_for_nobody() -> None:
     assert done.stderr == ""
 
 
-@pytest.mark.jit
-def test_a_start_of_which_one_kernel_is_missing_waits_before_it_compiles_it(tmp_path: Path) -> None:
-    """The mark says that all are there: nothing is written beside somebody who compiles, nor is half a file read."""
-    warmup.load()
-    folder = tmp_path / CACHE_DIR.name
+def kernels_copied(root: Path) -> Path:
+    """The kernels of this tree with their mark, below another cache root."""
+    folder = root / CACHE_DIR.name
     for package in (path.parent for path in (ROOT / "estimator").glob("*/__init__.py")):
         name = f"{package.name}_{hashlib.sha1(str(package).encode()).hexdigest()}"  # as numba names it
         if (CACHE_DIR / name).exists():
             shutil.copytree(CACHE_DIR / name, folder / name)
     shutil.copy(warmup.mark_of("warm"), folder)
+    return folder
+
+
+@pytest.mark.jit
+def test_a_start_of_which_one_kernel_is_missing_waits_before_it_compiles_it(tmp_path: Path) -> None:
+    """The mark says that all are there: nothing is written beside somebody who compiles, nor is half a file read."""
+    warmup.load()
+    folder = kernels_copied(tmp_path)
     missing = min(folder.glob("scan_matching_*/deskew.*.nbc"))
     missing.unlink()
     half = missing.with_name(f"{missing.name}.tmp.0123456789abcdef")
