@@ -9,6 +9,7 @@ Stop order: cycles, lidar (its laser is switched off), inputs, publishers, recor
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
 import math
@@ -52,6 +53,7 @@ from daemon.runtime.warmup import Warmth
 from daemon.runtime.worker import ThreadWorker, Worker
 from daemon.snapshot import Snapshot, State, Thread
 from daemon.system.descriptors import used_up
+from daemon.system.patience import within
 from daemon.system.processor_wait import ProcessorWait
 from daemon.system.realtime import claim, line_up
 from daemon.system.sd_notify import notify
@@ -77,6 +79,8 @@ EXTEND_US: Final = 30_000_000
 STARTING_S: Final = 900.0
 """The start timeout is extended for this long (s). After that the service manager restarts a start that does not end,
 because of a disk or of another process that compiles. The next start finds the kernels that are compiled already."""
+TRIAL_S: Final = 2.0
+"""Longest wait in s for the disk to take the count of starts."""
 PLACED: Final = (State.MAPPING, State.TRACKING, State.DEGRADED)
 """States with a usable pose in the map."""
 
@@ -201,8 +205,9 @@ class Daemon:
         warmth = await self._environment.warm_up()
         if isinstance(warmth, Warmth) and warmth.code_us > 0.0:
             self.cycle.parts.budget.learn_code(warmth.code_us)
-        if self._environment.store is not None:
-            self._environment.store.trial.begin()
+        if (store := self._environment.store) is not None:
+            with contextlib.suppress(TimeoutError):  # a start that is not counted; the disk has a fault of its own
+                within(TRIAL_S, store.trial.begin)
         if self._environment.start is not None:
             self._begin(self._environment.start.stored.meta.map_id)
             gc.freeze()  # excludes the loaded map from garbage collection

@@ -69,6 +69,7 @@ if TYPE_CHECKING:
     from estimator.numerics import se2 as se2
     from estimator.numerics.arrays import Array as Array
     from estimator.numerics.jit_cache import CACHE_DIR as CACHE_DIR
+    from estimator.numerics.jit_cache_file import CACHE_REPORT as CACHE_REPORT
     from estimator.pipeline import keyframe_poses as keyframe_poses
     from estimator.pipeline import render_map as render_map
     from estimator.pipeline import step as step
@@ -146,6 +147,7 @@ NAMES_OF: Final = {
     "": "scan_matching.icp scan_matching.local_map scan_matching.match_trace scan_matching.scan_matcher numerics.se2",
     # numerics
     "numerics.jit_cache": "CACHE_DIR",
+    "numerics.jit_cache_file": "CACHE_REPORT",
 }
 """Exported names by module; modules themselves under the empty key."""
 

@@ -37,7 +37,7 @@ ESTIMATOR: Final = "estimator."
 SYSTEM: Final = frozenset(
     (
         *("estimator.lazy_exports", "estimator.numerics.jit", "estimator.numerics.jit_cache"),
-        "estimator.numerics.jit_cache_load",
+        *("estimator.numerics.jit_cache_file", "estimator.numerics.jit_cache_load"),
     )
 )
 """Modules of the estimator that import modules or read files: nothing of them belongs into a state."""

@@ -15,9 +15,11 @@ from pathlib import Path
 import pytest
 
 from daemon.cli.doctor import examine
+from daemon.config.schema import PhotodiodeConfig
 from daemon.diagnosis.host import Heard, Host, Mute
 from daemon.maps.store import Store
 from daemon.publish.stream.messages import Fault, Faults, Pose
+from daemon.runtime.warmup import CannotLoad, Warmth
 from daemon.system import console
 from hal.errors import DeviceFault
 from hal.hokuyo.probe import Finding
@@ -46,7 +48,7 @@ class Computer(Host):
     follows: bool | None = True
     room: int = 10 << 30
     ports: dict[int, int] = field(default_factory=dict)
-    compiled: bool = True
+    warmth: Warmth | None = field(default_factory=lambda: Warmth(False, 0.8))
     no_cache: str = ""
     rights: bool = True
 
@@ -83,10 +85,11 @@ class Computer(Host):
     def resolved(self, host: str) -> str:
         return "Name or service not known" if host == "nohost" else ""
 
-    def warm(self, lights: bool) -> bool:
+    def warm(self, photodiode: PhotodiodeConfig) -> Warmth | None:
+        assert photodiode.fitted
         if self.no_cache:
-            raise RuntimeError(self.no_cache)
-        return self.compiled
+            raise CannotLoad(self.no_cache)
+        return self.warmth
 
     def realtime(self) -> bool:
         return self.rights
@@ -180,6 +183,10 @@ CASES = {
         "odometry.port",
     ),
     "no cache": (broken(no_cache="no writable directory"), "kernels", "no writable directory", "a folder of its own"),
+    "kernels not stored": (
+        broken(warmth=Warmth(True, 60.0, damaged=1, unwritten="/c/k: Read-only file system")),
+        *("kernels", "/c/k: Read-only file system; each start compiles them", "NUMBA_CACHE_DIR"),
+    ),
     "a fault of the daemon": (broken(heard=FAULTY), "daemon", "fault 104: no valid scan", "check the cable"),
     "not heard": (broken(heard=Mute("may not listen", "usermod")), "daemon", "may not listen", "usermod"),
     "no pose": (broken(heard=Heard("agv", 7)), "daemon", "tells no pose", "see its log"),
@@ -212,7 +219,8 @@ def test_a_lamp_that_is_missing_is_not_in_view(file: Path, capsys: pytest.Captur
 
 
 REMARKS = {
-    "cold": (broken(compiled=False), "kernels", "lumiloop warm"),
+    "cold": (broken(warmth=None), "kernels", "lumiloop warm"),
+    "kernels damaged": (broken(warmth=Warmth(True, 3.0, damaged=2)), "kernels", "the disk is failing"),
     "not synchronised": (broken(follows=False), "clock", "timedatectl"),
     "no real time": (broken(rights=False), "real time", "LimitRTPRIO"),
     "not running": (broken(), "lamps", "start it"),
