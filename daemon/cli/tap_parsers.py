@@ -177,7 +177,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--online", action="store_true", help="trajectories as published, not as known at the end")
     parser.add_argument("--force", action="store_true", help="replace an MCAP file that is there")
     config_arguments(parser)
-    parser.set_defaults(body=estimating("taps.mcap.export", "main"))
+    parser.set_defaults(body=estimating("taps.mcap.export", "main", "log_or_mcap"))
 
 
 def _record_mcap(parser: argparse.ArgumentParser) -> None:
