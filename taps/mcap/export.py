@@ -43,8 +43,6 @@ class OutputConflict(Exception):
 
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
-    if args.mcap is None and args.tum is None and args.kitti is None:
-        return console.fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", console.USAGE)
     try:
         with _stoppable():
             return _save(args) if args.source is None else _export(args)

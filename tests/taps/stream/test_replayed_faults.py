@@ -60,7 +60,7 @@ def test_a_film_shows_them_when_they_were(dark: tuple[Path, set[int]], tmp_path:
     from taps.view.replay_recorder import make
 
     recording, live = dark
-    make(recording, Config(), (False, ()), tmp_path / "film")
+    make(open_log(recording), Config(), (False, ()), tmp_path / "film")
     film = ReplayFile(recording, tmp_path / "film")
     film.refresh()
     assert (film.done, film.error) == (True, "")

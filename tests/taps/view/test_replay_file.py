@@ -205,7 +205,7 @@ def test_a_recording_is_shown_from_its_beginning_and_takes_no_orders(recording: 
 def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
     log, file = tmp_path / "log.clf", tmp_path / "film"
     log.write_text("nothing of use\n")
-    make(open_log(log), Config(), (False, ()), file)
+    command._record(log, Config(), (False, ()), file)
     film = ReplayFile(log, file)
     film.refresh()
     assert film.done
