@@ -35,8 +35,7 @@ from estimator.result import SURPRISE, Loop, LoopReason
 PHI: Final = 25.0
 """chi2 of three degrees of freedom at which a loop keeps a quarter of its weight: real maps deform more than noise."""
 
-SETTLED: Final = 1e-5
-MOST: Final = 100
+SETTLED, MOST = 1e-5, 100
 TOGETHER: Final = 60
 """Most keyframes between two loops of one consensus."""
 
