@@ -76,7 +76,7 @@ class Taken:
     def __init__(self) -> None:
         self._held: list[object] = []  # kept alive to the end: numbers are looked up by identity
         self._numbers: dict[int, int] = {}
-        self._submaps: dict[int, dict[str, Any]] = {}  # fields of submaps at the time of the capture
+        self._submaps: dict[int, tuple[Any, ...]] = {}  # fields of submaps at the time of the capture
         self._copy = b""
 
     def hold(self, one: object) -> int:
@@ -96,7 +96,7 @@ class Taken:
 
     def hold_all(self, submaps: Iterable[Submap]) -> None:
         """Adds submaps, and the submaps that they refer to, with their present field values."""
-        numbers, held = self._numbers, self._held
+        numbers, held, values = self._numbers, self._held, self._submaps
         waiting = list(submaps)
         while waiting:
             submap = waiting.pop()
@@ -105,7 +105,7 @@ class Taken:
             numbers[id(submap)] = len(held)
             held.append(submap)
             hung = tuple(submap.hung) if len(submap.hung) else ()
-            self._submaps[id(submap)] = {**dict(zip(_SUBMAP, _of_submap(submap), strict=True)), "hung": _Weak(hung)}
+            values[id(submap)] = *_of_submap(submap), hung
             waiting += hung
             if submap.into is not None:
                 waiting.append(submap.into[0])
@@ -137,8 +137,8 @@ class _Weak(tuple[object, ...]):
     """Elements of a `WeakSet`, which keep their order."""
 
 
-_SUBMAP: Final = tuple(field.name for field in fields(Submap) if field.name != "hung")
-_of_submap: Final = attrgetter(*_SUBMAP)
+_SUBMAP: Final = (*(field.name for field in fields(Submap) if field.name != "hung"), "hung")
+_of_submap: Final = attrgetter(*_SUBMAP[:-1])
 _submap_of: Final = attrgetter("submap")
 
 
@@ -271,7 +271,7 @@ _REDUCED: Final[dict[type, Callable[[Any, Taken], Any]]] = {
 class _Describer:
     """Makes the nodes of a graph of objects; each object becomes one node."""
 
-    def __init__(self, submaps: dict[int, dict[str, Any]]) -> None:
+    def __init__(self, submaps: dict[int, tuple[Any, ...]]) -> None:
         self._submaps = submaps
         self._numbers: dict[int, int] = {}
         self._kinds: dict[tuple[type, tuple[str, ...]], int] = {}
@@ -335,9 +335,7 @@ class _Describer:
             raise CannotTake(f"{kind.__module__}.{kind.__qualname__} belongs into no state")
         names = fields_of(kind)
         if kind is Submap:
-            said = self._submaps.get(id(one))
-            if said is None:
-                raise CannotTake(f"submap {one.key} was not there when the state was taken")
+            said = self._of_submap(one)
         elif names is None:
             said = attributes(one)
             names = tuple(said)
@@ -345,6 +343,12 @@ class _Describer:
             said = {name: getattr(one, name) for name in names}
         assert names is not None
         return Record(self._kind(kind, names), [self._value(said[name]) for name in names])
+
+    def _of_submap(self, submap: Submap) -> dict[str, Any]:
+        values = self._submaps.get(id(submap))
+        if values is None:
+            raise CannotTake(f"submap {submap.key} was not there when the state was taken")
+        return {**dict(zip(_SUBMAP, values, strict=True)), "hung": _Weak(values[-1])}
 
     def _kind(self, kind: type, names: tuple[str, ...]) -> int:
         number = self._kinds.get((kind, names))
