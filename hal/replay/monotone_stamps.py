@@ -210,7 +210,31 @@ def _spread_runs(levels: Array, resolution: float) -> Array:
         lengths[run] = min(whole, whole * sizes[run] / usual)
         begin[run] += (whole - lengths[run]) if run == 0 else 0.0
     within = np.arange(len(levels)) - np.repeat(first, sizes)
-    return np.asarray(np.repeat(begin, sizes) + within * np.repeat(lengths / sizes, sizes))
+    spread = np.repeat(begin, sizes) + within * np.repeat(lengths / sizes, sizes)
+    pauses = 1 + np.flatnonzero(np.diff(levels) > 1.5 * resolution)
+    reach = int(_SMOOTHED * usual)
+    return np.concatenate([_averaged(part, reach) for part in np.split(spread, pauses)])
+
+
+_SMOOTHED: Final = 2.0
+"""Steps of a coarse clock, before and after a record, over which its interval is averaged."""
+
+
+def _averaged(times: Array, reach: int) -> Array:
+    """Mean of the times of the ``reach`` records on each side; towards the ends at the mean interval there.
+
+    A step of the clock contains one record more or less than the next one; their mean interval is nearer the truth.
+    """
+    reach = min(reach, (len(times) - 1) // 2)
+    if reach < 1:
+        return times
+    window = 2 * reach + 1
+    sums = np.concatenate([[0.0], np.cumsum(times - times[0])])
+    middle = times[0] + (sums[window:] - sums[:-window]) / window
+    from_end = np.arange(reach, 0, -1)
+    before = middle[0] - from_end * (times[window - 1] - times[0]) / (window - 1)
+    after = middle[-1] + from_end[::-1] * (times[-1] - times[-window]) / (window - 1)
+    return np.concatenate([before, middle, after])
 
 
 def _isotonic(stamps: Array) -> Array:

@@ -101,7 +101,7 @@ def test_a_coarse_clock_is_spread_over_its_steps(step: float, part: float, round
     delay = clock.time - true
     assert np.ptp(delay) < 0.11
     assert abs(delay.mean()) < step
-    assert np.diff(clock.time) == pytest.approx(np.full(599, 0.0987), rel=0.35)
+    assert np.diff(clock.time) == pytest.approx(np.full(599, 0.0987), rel=0.15)
     assert not clock.refusal
 
 
