@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from estimator.fusion.motion_model import LARGEST_TURN as LARGEST_TURN
     from estimator.fusion.motion_model import LONGEST_CARRY_S as LONGEST_CARRY_S
     from estimator.fusion.motion_model import UNSEEN as UNSEEN
+    from estimator.job_queue import JOB_FUNCTIONS as JOB_FUNCTIONS
     from estimator.light_filter.light_channel import LightsSetup as LightsSetup
     from estimator.light_filter.residual_map import ResidualMap as ResidualMap
     from estimator.light_filter.survey import Lamp as Lamp
@@ -113,6 +114,7 @@ NAMES_OF: Final = {
         "Answer Beam Beams Command DegradationLevel Imu Job Limits Odometry Order Record Scan UNLIMITED no_lap"
     ),
     "numerics.arrays": "Array",
+    "job_queue": "JOB_FUNCTIONS",
     # results of a step
     "result": "Fix LightsResult Link LinkState Loop LoopReason MatchResult Reason StepResult SURPRISE Virtual",
     # CDMA: air interface, decoder, sample blocks and epochs

@@ -34,12 +34,20 @@ def later(module: str, name: str) -> Body:
     return configured(loaded(module, name))
 
 
-def estimating(module: str, name: str, what: str = "warm") -> Body:
-    """Like `later`, for a module that imports ``what`` of the estimator: announces a compilation of about a minute."""
+def estimating(module: str, name: str, opens: str, what: str = "warm") -> Body:
+    """Like `later`, for a module that imports ``what`` of the estimator: announces a compilation of about a minute.
+
+    ``opens``: function of `daemon.cli.inputs` that opens and judges the command's input before that.
+    """
 
     def body(args: argparse.Namespace) -> int:
+        from daemon.cli import inputs
         from daemon.runtime import warmup
 
+        try:
+            getattr(inputs, opens)(args)
+        except inputs.REFUSALS as error:
+            return fail(str(error))
         try:
             warmup.load_aloud(say, what, warmup.load, module)
         except warmup.CannotLoad as error:

@@ -19,6 +19,8 @@ from daemon.snapshot import GUESSED, State
 from estimator import Array
 
 _PROBE: Final = ".lumiloop-probe"
+DOUBTFUL: Final = 0.1
+"""Share of unconfirmed poses above which a result is doubtful as a whole."""
 _TUM_HEAD: Final = "# timestamp x y z qx qy qz qw\n"
 
 
@@ -165,6 +167,14 @@ def guessed(told: Trajectory) -> str:
     named = ", ".join(f"{state} {count}" for state, count in states.most_common())
     last = f"; the last one too ({guesses[-1]})" if guesses[-1] else ""
     return f"{states.total()} of {len(guesses)} poses are guesses, their place was not known ({named}){last}"
+
+
+def doubt(told: Trajectory) -> str:
+    """Returns a warning if more than :data:`DOUBTFUL` of the poses are unconfirmed; empty otherwise."""
+    share = sum(map(bool, told.guesses())) / max(1, len(told.stamps))
+    if share <= DOUBTFUL:
+        return ""
+    return f"{100.0 * share:.0f} % of the poses are guesses: do not rely on this trajectory, nor on its map"
 
 
 def kitti(trajectory: Trajectory) -> bytes:

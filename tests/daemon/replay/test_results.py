@@ -18,7 +18,7 @@ from daemon.maps.grid_files import greys, map_files, map_yaml, pgm
 from daemon.maps.map_drawing import WALL, draw, lettered
 from daemon.maps.map_server import FREE, OCCUPIED
 from daemon.maps.png import encode_png
-from daemon.replay.results import Folder, OutputRefused, Trajectory, guessed, kitti, tum
+from daemon.replay.results import Folder, OutputRefused, Trajectory, doubt, guessed, kitti, tum
 from daemon.replay.trajectories import Ledger
 from daemon.runtime.cycle_parts import CycleRecord
 from daemon.snapshot import Snapshot, State
@@ -44,6 +44,16 @@ GRID = Grid(np.array([-3.0, 7.5]), 0.05, LOGITS)
 def test_guesses_are_counted_in_a_sentence(states: list[State], said: str) -> None:
     count = len(states)
     assert guessed(Trajectory(np.arange(float(count)), np.zeros((count, 3)), np.array(states, np.int64))) == said
+
+
+@pytest.mark.parametrize(
+    ("guesses", "said"),
+    [(0, ""), (10, ""), (11, "11 % of the poses are guesses"), (100, "100 % of the poses are guesses")],
+)
+def test_guesses_in_more_than_a_tenth_are_a_warning(guesses: int, said: str) -> None:
+    states = np.repeat(np.array([State.RELOCATING, State.TRACKING], np.int64), [guesses, 100 - guesses])
+    assert doubt(Trajectory(np.arange(100.0), np.zeros((100, 3)), states)).startswith(said)
+    assert bool(doubt(Trajectory(np.arange(100.0), np.zeros((100, 3)), states))) == bool(said)
 
 
 def test_grid_pixels_run_from_the_top() -> None:

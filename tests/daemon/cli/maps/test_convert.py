@@ -21,6 +21,7 @@ from daemon.maps.image import image_from, meta_of, packed
 from daemon.maps.image_geometry import grid_of, placed
 from daemon.maps.store import Store
 from daemon.replay.log_replay import replay
+from daemon.replay.sources import open_log
 from daemon.system import console
 from estimator.mapping.keyframe import Keyframe
 from estimator.mapping.map_snapshot import Identity, MapImage
@@ -99,7 +100,7 @@ def test_tum_has_every_keyframe_where_it_lies(file: Path, tmp_path: Path, capsys
 
 def test_our_replay_finds_the_same_room_in_the_carmen_log(file: Path, tmp_path: Path) -> None:
     assert run("export", file, "--carmen", "--out", tmp_path / "out") == console.OK
-    outcome = replay(tmp_path / "out" / "keyframes.clf", Config())
+    outcome = replay(open_log(tmp_path / "out" / "keyframes.clf"), Config())
     assert outcome.stopped == ""
     frames = keyframes_of(file)
     assert outcome.source.status.scans == len(frames)
