@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Suites share the processors, and what is judged against the wall clock wants them alone: no two at once, -j or not.
 .NOTPARALLEL:
 
-.PHONY: help venv demo check quick test cover test-system test-all bless hooks bench bench-vm experiments install uninstall deb lock docs clean fuzz soak arm
+.PHONY: help venv demo check quick test cover test-system test-all bless hooks bench bench-vm experiments install uninstall deb lock docs clean fuzz slowest soak soak-hour arm
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -99,11 +99,20 @@ bench: $(PEERS)  ## figures as a table and as out/bench/*.json, ratios against p
 bench-vm: venv  ## the package in an emulated Debian with real kernel interfaces (root for the first run; docs/bench.md)
 	$(RUN) -m tools.bench.vm $(ARGS)
 
-fuzz: venv  ## damaged bytes to every parser, a tenth of the full size (ARGS="-m slow": all of it; ARGS="-k log")
-	$(BIN)/python -m pytest -q tests/fuzz/test_parsers.py -m "not slow" $(ARGS)
+# `make test` plays the same examples every time; here each run searches others.
+PROPERTIES = $$(grep -rl 'from hypothesis' tests --include='test_*.py' | grep -v tests/fuzz/test_parsers.py | sort)
+fuzz: venv  ## damaged bytes to every parser, a tenth of the full size, and new examples for every property (ARGS="-m slow", "-k log")
+	$(BIN)/python -m pytest -q tests/fuzz/test_parsers.py -m "not slow" $(ARGS) $(NONE)
+	$(BIN)/python -m pytest -q -n auto --dist loadfile --hypothesis-profile=search -m "$(QUICK)" $(PROPERTIES) $(ARGS) $(NONE)
 
-soak: venv  ## a simulated day, or ARGS="--days 30", ARGS="--real 60": does anything grow?
+slowest: venv  ## the slowest tests of `make test`, and why they are slow (ARGS="tests/daemon")
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -p tools.ci.slowest -m "$(QUICK)" $(ARGS)
+
+soak: venv  ## a simulated day, or ARGS="--days 30": do memory, threads, descriptors, files or cycle times grow?
 	$(RUN) -m tools.soak $(ARGS)
+
+soak-hour: venv  ## the same of the real processes at 40 Hz, for an hour (ARGS="--real 240": four)
+	$(RUN) -m tools.soak --real 60 $(ARGS)
 
 arm: venv  ## kernels and decoder for 64-bit ARM under qemu: the same numbers? (qemu-user-static, mmdebstrap)
 	$(RUN) -m tools.bench.system.aarch64 $(ARGS)
@@ -124,7 +133,7 @@ uninstall:  ## remove that; configuration and maps stay unless PURGE=1
 deb:  ## the same as a Debian package, in out/
 	systemd/package.sh
 
-EXTRAS  := --extra plot --extra mcap --extra foxglove --extra view --extra zenoh
+EXTRAS  := --extra plot --extra images --extra mcap --extra foxglove --extra view --extra zenoh
 COMPILE := uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --no-strip-extras --quiet --upgrade
 lock:  ## renew the lock files (needs uv)
 	$(COMPILE) pyproject.toml -o requirements/core.lock

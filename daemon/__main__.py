@@ -5,9 +5,12 @@ from __future__ import annotations
 import signal
 import sys
 
+from daemon.system.standard_streams import open_closed_streams
+
 
 def main() -> int:
     """Run one command and return its exit code. Ctrl-C during the import of its modules ends the process silently."""
+    open_closed_streams()
     raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # an ignored SIGINT stays ignored
     if raises:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

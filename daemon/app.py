@@ -9,6 +9,7 @@ Stop order: cycles, lidar (its laser is switched off), inputs, publishers, recor
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
 import math
@@ -47,10 +48,13 @@ from daemon.runtime.inbox import Inbox
 from daemon.runtime.scheduler import Pacemaker
 from daemon.runtime.snapshot_builder import SnapshotBuilder
 from daemon.runtime.stage_times import StageTimer
-from daemon.runtime.vitals import process_age_s, resident_mb, statistics, vitals
+from daemon.runtime.vitals import ProcessFacts, process_age_s, resident_mb, statistics, vitals
 from daemon.runtime.warmup import Warmth
 from daemon.runtime.worker import ThreadWorker, Worker
 from daemon.snapshot import Snapshot, State, Thread
+from daemon.system.descriptors import used_up
+from daemon.system.patience import within
+from daemon.system.processor_wait import ProcessorWait
 from daemon.system.realtime import claim, line_up
 from daemon.system.sd_notify import notify
 from estimator import Command, Order
@@ -75,6 +79,8 @@ EXTEND_US: Final = 30_000_000
 STARTING_S: Final = 900.0
 """The start timeout is extended for this long (s). After that the service manager restarts a start that does not end,
 because of a disk or of another process that compiles. The next start finds the kernels that are compiled already."""
+TRIAL_S: Final = 2.0
+"""Longest wait in s for the disk to take the count of starts."""
 PLACED: Final = (State.MAPPING, State.TRACKING, State.DEGRADED)
 """States with a usable pose in the map."""
 
@@ -90,6 +96,7 @@ class Daemon:
         self._environment, self._recorder = environment, recorder
         clock = environment.clock
         self._begun = clock.now()
+        self._wait = ProcessorWait()
         lights = environment.lights or load_lights(settings)
 
         opener = environment.opener if recorder is None else recorder.tap(environment.opener)
@@ -189,6 +196,7 @@ class Daemon:
             for kept in (self.last_pose, self._environment.sample_clock):
                 if kept is not None:
                     kept.close()
+            self._wait.close()
             await saving
             if self._recorder is not None:
                 self._recorder.close(ended=stop.is_set())
@@ -197,8 +205,9 @@ class Daemon:
         warmth = await self._environment.warm_up()
         if isinstance(warmth, Warmth) and warmth.code_us > 0.0:
             self.cycle.parts.budget.learn_code(warmth.code_us)
-        if self._environment.store is not None:
-            self._environment.store.trial.begin()
+        if (store := self._environment.store) is not None:
+            with contextlib.suppress(TimeoutError):  # a start that is not counted; the disk has a fault of its own
+                within(TRIAL_S, store.trial.begin)
         if self._environment.start is not None:
             self._begin(self._environment.start.stored.meta.map_id)
             gc.freeze()  # excludes the loaded map from garbage collection
@@ -347,7 +356,13 @@ class Daemon:
             failed.add("stored map")
         if self.threads.look() - {Thread.I2C}:  # the bus has faults of its own
             failed.add("thread")
-        return vitals(self.cycle.facts(), failed, max(lateness, self.pacemaker.latest()))
+        return vitals(self.cycle.facts(), failed, self._process(max(lateness, self.pacemaker.latest())))
+
+    def _process(self, lateness: float) -> ProcessFacts:
+        """Facts on the process; in virtual time nothing but the delay, because the processor does not count there."""
+        if self._environment.stopwatch is None:
+            return ProcessFacts(lateness)
+        return ProcessFacts(lateness, self._wait.seconds() or 0.0, used_up())
 
 
 class _FirstPose:

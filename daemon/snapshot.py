@@ -137,7 +137,8 @@ class Condition:
     """Health of the daemon's components.
 
     Attributes:
-        uptime_s: seconds since the start. faults: numbers of all present faults, gravest first.
+        uptime_s: seconds since the start. faults: numbers of all present faults, the gravest cause
+            first, each followed by its consequences.
         restarts: of each :class:`Part`, in order. down: components that are down. hanging: threads that do not respond.
     """
 

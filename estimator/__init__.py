@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from estimator.fusion.motion_model import LARGEST_TURN as LARGEST_TURN
     from estimator.fusion.motion_model import LONGEST_CARRY_S as LONGEST_CARRY_S
     from estimator.fusion.motion_model import UNSEEN as UNSEEN
+    from estimator.job_queue import JOB_FUNCTIONS as JOB_FUNCTIONS
     from estimator.light_filter.light_channel import LightsSetup as LightsSetup
     from estimator.light_filter.residual_map import ResidualMap as ResidualMap
     from estimator.light_filter.survey import Lamp as Lamp
@@ -69,6 +70,7 @@ if TYPE_CHECKING:
     from estimator.numerics import se2 as se2
     from estimator.numerics.arrays import Array as Array
     from estimator.numerics.jit_cache import CACHE_DIR as CACHE_DIR
+    from estimator.numerics.jit_cache_file import CACHE_REPORT as CACHE_REPORT
     from estimator.pipeline import keyframe_poses as keyframe_poses
     from estimator.pipeline import render_map as render_map
     from estimator.pipeline import step as step
@@ -114,6 +116,7 @@ NAMES_OF: Final = {
         "Answer Beam Beams Command DegradationLevel Imu Job Limits Odometry Order Record Scan UNLIMITED no_lap"
     ),
     "numerics.arrays": "Array",
+    "job_queue": "JOB_FUNCTIONS",
     # results of a step
     "result": (
         "Fix LightsResult Link LinkState Loop LoopReason MatchResult Reason SlowError SlowErrors StepResult SURPRISE "
@@ -151,6 +154,7 @@ NAMES_OF: Final = {
     "": "scan_matching.icp scan_matching.local_map scan_matching.match_trace scan_matching.scan_matcher numerics.se2",
     # numerics
     "numerics.jit_cache": "CACHE_DIR",
+    "numerics.jit_cache_file": "CACHE_REPORT",
 }
 """Exported names by module; modules themselves under the empty key."""
 

@@ -1,10 +1,16 @@
-"""The queue of background jobs: those to be started, and those whose result is pending."""
+"""The queue of background jobs: those to be started, and those whose result is pending.
+
+A job is a description: two functions marked by :func:`job_function`, each with its arguments. A checkpoint of the state
+stores the description, and a replay can start the job again from it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from enum import Enum
+from functools import partial
+from typing import Any, Final, TypeVar
 
 from estimator.measurements import Answer, Job
 
@@ -14,7 +20,26 @@ LOST: Final = 100
 SEARCH, SOLVE, SETTLE, DRAW = 3, 2, 1, 9
 """Priorities, lowest first: search the map, solve the graph, finish a submap; draw the map after all of these."""
 
-Apply = Callable[[object], None]
+Apply = partial[None]
+"""Receives the payload of a result as its last argument."""
+
+F = TypeVar("F", bound=Callable[..., object])
+
+JOB_FUNCTIONS: Final[set[Callable[..., object]]] = set()
+"""All functions that a job may consist of."""
+
+
+class Owner(Enum):
+    """Owner of a job that belongs to no particular object."""
+
+    LOOP_SEARCH = "loop search"
+    SOLUTION = "solution"
+
+
+def job_function(function: F) -> F:
+    """Mark a module-level function that a job consists of. A checkpoint refers to it by package and name."""
+    JOB_FUNCTIONS.add(function)
+    return function
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,8 +73,11 @@ class JobQueue:
     next_id: int = 1
     keyframes: int = 0
 
-    def ask(self, priority: int, run: Callable[[], object], apply: Apply, owner: object = None) -> None:
-        """Queue a job; ``apply`` receives its payload in the step with the result."""
+    def ask(self, priority: int, run: partial[Any], apply: Apply, owner: object = None) -> None:
+        """Queue a job; ``apply`` receives its payload in the step with the result.
+
+        Both are partial calls of functions marked by :func:`job_function`.
+        """
         self.waiting.append(Job(self.next_id, priority, run))
         self.pending[self.next_id] = Pending(owner, self.keyframes, apply)
         self.next_id += 1

@@ -21,9 +21,10 @@ class Blemish(Flag):
     STRETCHED = auto()  # longer than its bits take: returned late, or its samples are not evenly spaced
     CLIPPED = auto()  # words at either rail, or as close to it as the amplifier gets
     STUCK = auto()  # the same word over and over
-    MISALIGNED = auto()  # upper bits set: shifted or lost bits, or a floating bus
+    MISALIGNED = auto()  # upper bits set, or lowest bits always 0: shifted or lost bits, or a floating bus
     SHORT = auto()  # fewer words than requested
     GAP = auto()  # blocks are missing before this one: dropped, or the bus was not read for longer than a block
+    REPAIRED = auto()  # single words had upper bits set; each was replaced by the mean of its neighbours
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,9 +26,10 @@ class LidarGeometry:
 
     Attributes:
         ares: steps per full turn; not necessarily whole for a log.
-        afrt: step that points along the device's x axis (front); not necessarily whole for a log.
+        afrt: step that points along the device's x axis (front); not necessarily whole for a log, nor measurable.
         amin, amax: first and last measurable step.
         dmin, dmax: legal distances in range units; below ``dmin`` a value is an error code, above ``dmax`` no return.
+            A driver knows further codes between the two.
         range_unit_m: metres per range unit (SCIP: 0.001).
         period_s: nominal time of a revolution in seconds (SCIP ``60 / SCAN``).
         beam_dt_s: time between adjacent steps in seconds; 0 where a log does not give it.
@@ -48,8 +49,12 @@ class LidarGeometry:
     beam_dt_s: float
 
     def bearings(self, first_step: int, stride: int, count: int) -> npt.NDArray[np.float64]:
-        """Bearings in rad of ``count`` beams, counter-clockwise positive seen from above, zero at ``afrt``."""
-        steps = first_step + stride * np.arange(count, dtype=np.float64)
+        """Bearings in rad of ``count`` beams, counter-clockwise positive seen from above, zero at ``afrt``.
+
+        Each beam stands for ``stride`` adjacent steps, the first one from ``first_step`` on. Its bearing is that of
+        their middle.
+        """
+        steps = first_step + 0.5 * (stride - 1) + stride * np.arange(count, dtype=np.float64)
         return np.asarray((steps - self.afrt) * (2.0 * np.pi / self.ares))
 
 
@@ -60,11 +65,12 @@ class RawScan:
     Attributes:
         seq: counts complete scans of this driver from 0; gaps mean scans that were received but unusable.
         t_rx: ``t_mono`` at which the last byte arrived, taken before any decoding.
-        t_mono: ``t_mono`` at which the beam ``first_step`` was measured (device clock mapped to the host's).
+        t_mono: ``t_mono`` at which the middle of the first beam was measured (device clock mapped to the host's).
         t_sigma: one-sigma uncertainty of ``t_mono`` in seconds.
         t_tick: the device's own stamp (24-bit milliseconds for SCIP), -1 where there is none.
+        first_step: the first step of the first beam. stride: steps of a beam (`LidarGeometry.bearings`).
         ranges: int32, range units, 0 where ``code`` is not :data:`VALID`.
-        code: int32, :data:`VALID` or the raw value that was no distance (error code below dmin, or above dmax).
+        code: int32, :data:`VALID` or the raw value that was no distance (an error code, or above dmax).
         intensity: int32 or None.
         echoes: int32 of shape (beams, 3), further echoes of a multi-echo device, 0 where none; or None.
     """

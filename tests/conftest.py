@@ -10,7 +10,7 @@ import inspect
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,13 @@ import pytest
 from hypothesis import settings
 
 from hal.clock import run_virtual
+from tests.pace import Pace, judge
 
-settings.register_profile("shared machine", deadline=None)
-settings.load_profile("shared machine")  # how long an example takes there says nothing; `tests/fuzz` judges stalls
+settings.register_profile("the same examples", deadline=None, derandomize=True)
+settings.register_profile("search", deadline=None)
+settings.load_profile("the same examples")
+"""How long an example takes on a shared machine says nothing (`tests/fuzz` judges stalls). `make fuzz` searches anew
+each time, with ``--hypothesis-profile=search``."""
 
 ROOT = Path(__file__).parents[1]
 UNTRACED = ("estimator", "faults", "fuzz", "hil", "logs", "tools")
@@ -37,6 +41,8 @@ FIRST = (
 )
 """Files that take minutes, longest first: where files are shared out to the cores none of them is begun last."""
 COMPILING_S = 900.0
+PACE = pytest.StashKey[Pace]()
+"""Pace of the machine beside a test of real time."""
 LIMIT = pytest.StashKey[tuple[pytest.Item, Any]]()
 """The test whose time runs, and its limit as pytest-timeout has it."""
 
@@ -151,6 +157,26 @@ def pytest_timeout_cancel_timer(item: pytest.Item) -> None:
     """Nobody's does."""
     if LIMIT in item.config.stash:
         del item.config.stash[LIMIT]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Measure the pace of the machine beside a test that is judged against the wall clock."""
+    if item.get_closest_marker("realtime") is None:
+        return (yield)
+    pace = item.stash[PACE] = Pace()
+    try:
+        return (yield)
+    finally:
+        pace.stop()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """A failure on a machine that is too busy is no verdict."""
+    report = yield
+    judge(report, item.stash.get(PACE, None))
+    return report
 
 
 @pytest.fixture(autouse=True)

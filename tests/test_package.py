@@ -40,7 +40,7 @@ def test_locks_have_everything_that_is_named() -> None:
     groups = PROJECT["dependency-groups"]
     tools = {name: [one for one in group if isinstance(one, str)] for name, group in groups.items()}
     extras = PROJECT["project"]["optional-dependencies"] | tools
-    dev = ["test", "dev", "plot", "mcap", "foxglove", "view", "zenoh"]
+    dev = ["test", "dev", "plot", "images", "mcap", "foxglove", "view", "zenoh"]
     for lock, named in {"core": [], "dev": dev, "bench": [*dev, "bench"]}.items():
         kept = {name_of(row) for row in (ROOT / f"requirements/{lock}.lock").read_text().splitlines()}
         wanted = [*PROJECT["project"]["dependencies"], *(one for extra in named for one in extras[extra])]

@@ -55,9 +55,9 @@ def main(args: argparse.Namespace) -> int:
     args.out = args.out or (CONFIG_OUT if wheels else SURVEY_OUT)
     try:
         refuse_overwriting(args.out, args.force)  # before the work, not after it
-        drive = read_drive(args.log, args.settings, Given(args.config is not None, keys))
-        if drive.stopped:
-            sys.stderr.write(f"lumiloop: {drive.stopped}; the drive up to there is used\n")
+        drive = read_drive(args.source, args.settings, Given(args.config is not None, keys))
+        for sentence in drive.warnings:
+            console.say(sentence)
         if wheels:
             return calibrate_wheels(drive, args)
         return _lights(args, drive)

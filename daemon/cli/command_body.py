@@ -13,6 +13,7 @@ from pathlib import Path
 
 from daemon.system.console import OK, USAGE, fail, say
 from daemon.system.extras import how_to_install
+from daemon.system.logging import start_command_log
 
 OURS = ("daemon", "estimator", "hal", "taps")
 
@@ -33,12 +34,20 @@ def later(module: str, name: str) -> Body:
     return configured(loaded(module, name))
 
 
-def estimating(module: str, name: str, what: str = "warm") -> Body:
-    """Like `later`, for a module that imports ``what`` of the estimator: announces a compilation of about a minute."""
+def estimating(module: str, name: str, opens: str, what: str = "warm") -> Body:
+    """Like `later`, for a module that imports ``what`` of the estimator: announces a compilation of about a minute.
+
+    ``opens``: function of `daemon.cli.inputs` that opens and judges the command's input before that.
+    """
 
     def body(args: argparse.Namespace) -> int:
+        from daemon.cli import inputs
         from daemon.runtime import warmup
 
+        try:
+            getattr(inputs, opens)(args)
+        except inputs.REFUSALS as error:
+            return fail(str(error))
         try:
             warmup.load_aloud(say, what, warmup.load, module)
         except warmup.CannotLoad as error:
@@ -49,9 +58,13 @@ def estimating(module: str, name: str, what: str = "warm") -> Body:
 
 
 def loaded(module: str, name: str) -> Body:
-    """Returns a body that loads its module when it runs."""
+    """Returns a body that loads its module when it runs. What serves clients (`taps`) has a limit of tracebacks."""
 
     def body(args: argparse.Namespace) -> int:
+        if module.startswith("taps."):
+            from daemon.system.traceback_limit import limit_tracebacks
+
+            limit_tracebacks()
         run: Body = getattr(import_module(module), name)
         return run(args)
 
@@ -98,6 +111,7 @@ def needing(extra: str, module: str, name: str) -> Body:
             if missing in OURS:
                 raise
             return fail(f"this command needs {missing}, which is not installed: {how_to_install(extra)}")
+        start_command_log()
         return loaded(module, name)(args)
 
     return configured(body)

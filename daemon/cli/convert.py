@@ -15,5 +15,7 @@ def main(args: argparse.Namespace) -> int:
         scans = convert.convert(args.source, args.log, args.logged, delay, args.all)
     except convert.NotConverted as error:
         return console.fail(str(error))
+    for sentence in scans.report.sentences():
+        console.say(f"{args.source}: {sentence}")
     console.say(f"{len(scans.stamps)} scans of {scans.ranges.shape[1]} beams into {args.log}")
     return console.OK

@@ -135,7 +135,7 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     known = "; ".join(f"{name}: {what}" for name, what in METHODS.items())
     parser.add_argument("--method", choices=METHODS, default=LUMILOOP, help=f"{known}; default: {LUMILOOP}")
     config_arguments(parser)
-    parser.set_defaults(body=estimating("daemon.cli.replay", "main"))
+    parser.set_defaults(body=estimating("daemon.cli.replay", "main", "log"))
 
 
 def _convert(parser: argparse.ArgumentParser) -> None:
@@ -158,7 +158,7 @@ def _why(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=_picture, metavar="FILE", help="and draw it: .png, .svg or .pdf")
     config_arguments(parser)
-    parser.set_defaults(body=estimating("daemon.cli.why", "main"))
+    parser.set_defaults(body=estimating("daemon.cli.why", "main", "moment"))
 
 
 def _status(parser: argparse.ArgumentParser) -> None:
@@ -183,7 +183,7 @@ def _map(parser: argparse.ArgumentParser) -> None:
     export.add_argument("--tum", action="store_true", help="keyframes.tum: where the keyframes of a map file lie")
     export.add_argument("--carmen", action="store_true", help="keyframes.clf: and their scans")
     config_arguments(export)
-    export.set_defaults(body=estimating("daemon.cli.maps.export", "main"))
+    export.set_defaults(body=estimating("daemon.cli.maps.export", "main", "log_or_map"))
     taken = verbs.add_parser("import", help="make a map to be localised in of one of map_server's or nav2's")
     taken.add_argument("yaml", type=Path, metavar="YAML", help="the description; the picture lies beside it")
     taken.add_argument("--name", metavar="TEXT", help="floor or building; default: the file's name")
@@ -191,12 +191,12 @@ def _map(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="FILE", help="default: the configured folder of maps; the next start takes it"
     )
     config_arguments(taken)
-    taken.set_defaults(body=estimating("daemon.cli.maps.convert", "take_in", "warm-plan"))
+    taken.set_defaults(body=estimating("daemon.cli.maps.convert", "take_in", "map_server", "warm-plan"))
     render = verbs.add_parser("render", help="draw a map file as a picture")
     render.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     render.add_argument("out", type=Path, metavar="PNG", help="picture to write")
     config_arguments(render)
-    render.set_defaults(body=estimating("daemon.cli.maps.convert", "render", "warm-plan"))
+    render.set_defaults(body=estimating("daemon.cli.maps.convert", "render", "map_file", "warm-plan"))
     _map_changes(verbs)
     info = verbs.add_parser("info", help="say what a map file holds")
     info.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
@@ -238,14 +238,14 @@ def _calibrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lidar-mount", action="store_true", help="where the lidar sits, instead of lights")
     other = "with --odometry or --lidar-mount the configuration, lumiloop-calibrated.toml"
     _written(parser, f"survey to write, default lights-calibrated.toml; {other}")
-    parser.set_defaults(body=estimating("daemon.cli.calibrate", "main", "warm-teach"))
+    parser.set_defaults(body=estimating("daemon.cli.calibrate", "main", "log", "warm-teach"))
 
 
 def _survey(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="REC", help="recording of a drive under the lamps")
     parser.add_argument("--height", type=float, metavar="M", help="of the lamps above the floor; default: estimated")
     _written(parser, "survey to write; default: lights.toml", Path("lights.toml"))
-    parser.set_defaults(body=estimating("daemon.cli.survey", "main", "warm-teach"))
+    parser.set_defaults(body=estimating("daemon.cli.survey", "main", "log", "warm-teach"))
 
 
 def _written(parser: argparse.ArgumentParser, what: str, default: Path | None = None) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from daemon.replay.log_replay import Outcome, replay
 from daemon.replay.recorded_inputs import Given
 from daemon.replay.report import write_all
-from daemon.replay.results import Folder, OutputRefused, guessed
+from daemon.replay.results import Folder, OutputRefused, doubt, guessed
 from daemon.runtime import warmup
 from daemon.system import console
 from estimator.paper import LUMILOOP
@@ -43,11 +43,11 @@ def command(
     journal: MatchJournal | None = None,
     method: str = LUMILOOP,
 ) -> int:
-    """Replays ``args.log``, lets ``write`` put results into ``args.out``, reports, and returns the exit code."""
+    """Replays ``args.source``, lets ``write`` put results into ``args.out``, reports, and returns the exit code."""
     try:
         folder = Folder(args.out)
         keys = tuple(override.partition("=")[0].strip() for override in args.set)
-        outcome = replay(args.log, args.settings, Given(args.config is not None, keys), journal, method)
+        outcome = replay(args.source, args.settings, Given(args.config is not None, keys), journal, method)
         write(folder, outcome)
     except (HalError, OutputRefused, warmup.CannotLoad) as error:
         return console.fail(str(error))
@@ -79,6 +79,7 @@ def _verdict(outcome: Outcome) -> int:
         return console.fail("none of the matches asked for is in the log; the other results are written")
     log_s, run_s = rerun.t_mono - rerun.t_first, outcome.seconds["run"]
     speed = f"{log_s:.1f} s of log in {run_s:.1f} s ({log_s / run_s:.0f} x real time)"
-    for sentence in filter(None, (f"{len(rerun.ledger)} poses, {speed}", guessed(rerun.ledger.online()))):
+    online = rerun.ledger.online()
+    for sentence in filter(None, (f"{len(rerun.ledger)} poses, {speed}", guessed(online), doubt(online))):
         sys.stderr.write(f"replay: {sentence}\n")
     return console.OK

@@ -21,11 +21,12 @@ from daemon.config.survey_loader import SurveyError
 from daemon.devices.light_setup import load_lights
 from daemon.devices.sample_clock import SampleClock
 from daemon.environment import Environment
-from daemon.maps.initial_state import NoMap, started
+from daemon.maps.initial_state import NoMap, started_in_time
 from daemon.runtime.stall_watch import StallWatch
 from daemon.runtime.warmup import CannotLoad, warm_up
 from daemon.system.console import FAILED, OK, USAGE
 from daemon.system.logging import start_log
+from daemon.system.patience import reported
 from daemon.system.realtime import give_back
 from daemon.system.sd_notify import managed, notify
 from hal.clock import SystemClock
@@ -61,7 +62,8 @@ def main(args: argparse.Namespace) -> int:
     recorder = None
     give_back()
     try:
-        environment = _environment(settings)
+        with reported("the survey and the stored map"):
+            environment = _environment(settings)
         log.info("%s", _whereabouts(settings, args.record, environment.stream))
         if args.record is not None:
             from daemon.recording.recorder import Recorder
@@ -91,11 +93,11 @@ def _environment(settings: Config) -> Environment:
     """Returns the real environment with the stored map and the survey; raises `SurveyError` and `NoMap`."""
     stream = runtime_folder() / f"{settings.name}.stream"
     if not settings.photodiode.fitted:
-        store, start = started(settings.map, None)
+        store, start = started_in_time(settings.map, None)
         return Environment(SystemClock(), store=store, start=start, stream=stream)
     clock = SampleClock(settings.photodiode)
     lights = load_lights(settings, clock.ppm)
-    store, start = started(settings.map, lights)
+    store, start = started_in_time(settings.map, lights)
     environment = Environment(SystemClock(), store=store, start=start, stream=stream)
     return replace(environment, warm_up=partial(warm_up, lights=lights), lights=lights, sample_clock=clock)
 

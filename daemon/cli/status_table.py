@@ -23,6 +23,7 @@ def as_object(reading: Reading, stalled: bool) -> dict[str, Any]:
         "state": _state(reading["state"]),
         "reason_text": _meaning("reason", reading["reason"]),
         "fault_text": _meaning("fault", reading["fault"]),
+        "fault_causes": {str(fault): cause for fault, cause in _causes(reading).items() if cause},
         "flags": registers.decode_bits(registers.FLAGS, reading["flags"]),
         "devices": registers.decode_bits(registers.DEVICES, reading["devices"]),
         "stalled": stalled,
@@ -76,9 +77,23 @@ def as_table(reading: Reading, stalled: bool) -> str:
 
 
 def _more_faults(reading: Reading) -> list[tuple[str, str]]:
-    """Returns the rows of the faults beside the gravest."""
-    numbers = [reading.get(f"fault_{k}") for k in range(2, parts_block.FAULTS + 1)]
-    return [("", _meaning("fault", number)) for number in numbers if number]
+    """Returns the rows of the faults beside the gravest; a consequence stands indented below its cause."""
+    rows = []
+    for fault, cause in list(_causes(reading).items())[1:]:
+        said = _meaning("fault", fault)
+        rows.append(("", f"  follows: {said.partition(' (')[0]}" if cause else said))
+    return rows
+
+
+def _causes(reading: Reading) -> dict[int, int]:
+    """Returns the present faults in their published order, each with the fault that it follows from (0: none)."""
+    numbers = [reading.get(f"fault_{k}") for k in range(1, parts_block.FAULTS + 1)]
+    present = [int(number) for number in numbers if number]
+    if not present:
+        return {}
+    from daemon.health.causes import cause_of
+
+    return {fault: cause_of(fault, present) for fault in present}
 
 
 def _parts(reading: Reading) -> list[tuple[str, str]]:

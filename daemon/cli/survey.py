@@ -22,9 +22,9 @@ def main(args: argparse.Namespace) -> int:
         )
     keys = tuple(override.partition("=")[0].strip() for override in args.set)
     try:
-        drive = read_drive(args.log, args.settings, Given(args.config is not None, keys))
-        if drive.stopped:
-            sys.stderr.write(f"lumiloop: {drive.stopped}; the drive up to there is used\n")
+        drive = read_drive(args.source, args.settings, Given(args.config is not None, keys))
+        for sentence in drive.warnings:
+            console.say(sentence)
         found = survey(heard(drive), drive.survey.receiver, drive.survey.depth, args.height)
         sys.stdout.write(report(found, args.height))
         head = [

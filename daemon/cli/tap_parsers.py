@@ -9,7 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from daemon.cli.command_body import config_arguments, estimating, later, listening, loaded, needing
+from daemon.cli.command_body import Body, config_arguments, estimating, later, listening, loaded, needing
+from daemon.system.console import USAGE, fail
 
 Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse has no public name for it
 MOST_DOMAIN = 232
@@ -45,6 +46,13 @@ def _metrics(parser: argparse.ArgumentParser) -> None:
 
 def _foxglove(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", default="127.0.0.1:8765", metavar="HOST:PORT", help="default: 127.0.0.1:8765")
+    parser.add_argument(
+        "--origin",
+        action="append",
+        default=[],
+        metavar="URL",
+        help="a web app that may connect, as https://app.example; Foxglove's own and installed apps always may",
+    )
     listening(parser)
     parser.set_defaults(body=needing("foxglove", "taps.foxglove.live", "main"))
 
@@ -177,7 +185,16 @@ def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--online", action="store_true", help="trajectories as published, not as known at the end")
     parser.add_argument("--force", action="store_true", help="replace an MCAP file that is there")
     config_arguments(parser)
-    parser.set_defaults(body=estimating("taps.mcap.export", "main"))
+    parser.set_defaults(body=_writing(estimating("taps.mcap.export", "main", "log_or_mcap")))
+
+
+def _writing(body: Body) -> Body:
+    def check_and_run(args: argparse.Namespace) -> int:
+        if args.mcap is None and args.tum is None and args.kitti is None and not args.print_config:
+            return fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", USAGE)
+        return body(args)
+
+    return check_and_run
 
 
 def _record_mcap(parser: argparse.ArgumentParser) -> None:

@@ -17,21 +17,23 @@ if TYPE_CHECKING:
 def main(args: argparse.Namespace) -> int:
     """Runs the command ``warm``; ``args.settings`` determines whether there is a photodiode.
 
-    If an earlier start has compiled everything, nothing is loaded. The daemon waits for this command at every boot and
-    then loads the kernels itself.
+    It loads every kernel, also where an earlier start has compiled them all: a file may have been damaged since.
     """
     settings: Config = args.settings
     try:
         lights = _lights(settings)
-        if warmup.is_warm(lights is not None):
-            console.say("an earlier start has compiled the kernels")
-            return console.OK
         warmth = warmup.load(lights)
     except SurveyError as error:
         return console.fail(str(error), console.USAGE)
     except warmup.CannotLoad as error:
         return console.fail(str(error))
-    console.say(f"kernels compiled in {warmth.seconds:.1f} s")
+    if warmth.compiled and warmth.unwritten:
+        return console.fail(f"kernels compiled in {warmth.seconds:.1f} s; {warmup.EACH} ({warmth.unwritten})")
+    if not warmth.compiled:
+        console.say(f"an earlier start has compiled the kernels; they load in {warmth.seconds:.1f} s")
+    else:
+        damaged = f"; {warmth.damaged} of their files were damaged" if warmth.damaged else ""
+        console.say(f"kernels compiled in {warmth.seconds:.1f} s{damaged}")
     return console.OK
 
 

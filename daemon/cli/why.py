@@ -10,13 +10,11 @@ import argparse
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
 
-from daemon.config.paths import SERVICE_STATE, recordings_folder
 from daemon.diagnosis import moment_plot, moment_report
 from daemon.diagnosis.moment import Moment, chosen
 from daemon.diagnosis.moment_replay import moments
-from daemon.diagnosis.recorded_spans import NoMoment, find, is_folder, spans, whole_second
+from daemon.diagnosis.recorded_spans import whole_second
 from daemon.replay.results import Folder, OutputRefused
 from daemon.replay.runner import Rerun
 from daemon.runtime import warmup
@@ -24,18 +22,11 @@ from daemon.system import console
 from daemon.system.extras import how_to_install
 from hal.errors import HalError
 
-FLIGHT: Final = "flight"
-"""Folder of recordings if none is named, below our state directory or else the service's."""
-
 
 def main(args: argparse.Namespace) -> int:
-    """Runs the command; ``args``: the ``time`` as typed, ``log`` or None, plot file (``out``) or None."""
-    folder = args.log or recordings_folder(FLIGHT)
+    """Runs the command; ``args``: the ``time`` as typed, the recording ``found``, plot file (``out``) or None."""
+    span, utc, wide = args.found
     try:
-        if args.log is None and not is_folder(folder):
-            looked = f"nothing is recorded in {folder}, nor in {SERVICE_STATE / FLIGHT}"
-            return console.fail(f"{looked}; name a recording, or run with --record {folder} --last 10")
-        span, utc, wide = find(spans(folder), args.time, folder)
         if args.out is not None:
             _try(args.out)
         told, rerun = moments(span, utc)
@@ -47,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
             )
         if args.out is not None:
             _draw(args.out, told, max(utc, told[chosen(told, utc, second, wide).cycle].utc), rerun)
-    except (HalError, NoMoment, OutputRefused, warmup.CannotLoad) as error:
+    except (HalError, OutputRefused, warmup.CannotLoad) as error:
         return console.fail(str(error))
     return console.OK
 

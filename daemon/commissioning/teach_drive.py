@@ -18,9 +18,9 @@ import numpy.typing as npt
 from daemon.config.schema import Config
 from daemon.devices.conversion import SampleBridge
 from daemon.replay.recorded_inputs import Given, config_for, lights_for
-from daemon.replay.results import Trajectory
+from daemon.replay.results import Trajectory, doubt
 from daemon.replay.runner import Rerun
-from daemon.replay.sources import Source, open_log
+from daemon.replay.sources import Source
 from estimator import UNUSABLE, Array, LightEpoch, Profile, Survey, decode, new_decoder, search
 from estimator.calibration import Heard, Rows
 from hal.adc import RawSamples
@@ -43,7 +43,7 @@ class Drive:
         readings: of the odometry, (n, 4) stamp, x, y, yaw (s, m, m, rad).
         config: the recording's, or the requested one.
         profile: air interface of the light, None without a photodiode.
-        stopped: why reading ended early, empty otherwise.
+        stopped: why reading ended early, empty otherwise. doubt: why its poses are not reliable, empty if they are.
     """
 
     path: Path
@@ -54,6 +54,15 @@ class Drive:
     config: Config = field(default_factory=Config)
     profile: Profile | None = None
     stopped: str = ""
+    doubt: str = ""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What limits the use of the drive, one sentence each."""
+        return [
+            *([f"{self.stopped}; the drive up to there is used"] if self.stopped else []),
+            *filter(None, [self.doubt]),
+        ]
 
     @property
     def mount(self) -> Array:
@@ -62,16 +71,15 @@ class Drive:
         return np.array((mount.x, mount.y, np.radians(mount.yaw)))
 
 
-def read_drive(path: Path, settings: Config, given: Given) -> Drive:
+def read_drive(source: Source, settings: Config, given: Given) -> Drive:
     """Replays a recording for its poses and decodes its light.
 
     Raises:
-        HalError: it cannot be opened, has no scans, or its light setup is not of this version.
+        HalError: it has no scans, or its light setup is not of this version.
     """
-    source = open_log(path)
     used = config_for(source, settings, given)
     lights = lights_for(source, used, given)
-    drive = Drive(path, Trajectory(np.zeros(0), np.zeros((0, 3))), Survey() if lights is None else lights.survey)
+    drive = Drive(source.path, Trajectory(np.zeros(0), np.zeros((0, 3))), Survey() if lights is None else lights.survey)
     drive.config, drive.profile = used, None if lights is None else lights.profile
     rerun, readings = Rerun(source, used), []
     bridge = None if lights is None else SampleBridge(lights.profile)
@@ -91,6 +99,7 @@ def read_drive(path: Path, settings: Config, given: Given) -> Drive:
     except HalError as error:
         drive.stopped = str(error)
     rerun.finish()
+    drive.doubt = doubt(rerun.ledger.online())
     drive.poses, drive.readings = rerun.ledger.final(), np.array(readings).reshape(-1, 4)
     _check(source, drive)
     return drive

@@ -30,6 +30,8 @@ DEFAULT_RTU: Final = (19200, "8E1", 1)
 """
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+_MAPPED_BITS: Final = 96
+"""Bits before the IPv4 address in an IPv4-mapped IPv6 address."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,18 +131,27 @@ def parse_line(text: str) -> RtuLine:
 
 
 def parse_network(text: str) -> Network:
-    """Parse an IP address or a network.
+    """Parse an IP address or a network; an IPv4-mapped one (``::ffff:192.168.0.0/120``) is the IPv4 network.
 
     Raises:
         ValueError: states what is wrong and what was expected.
     """
     try:
-        return ipaddress.ip_network(text)
-    except ValueError as error:
-        if "host bits set" in str(error):
-            whole = ipaddress.ip_network(text, strict=False)
-            raise ValueError(f"Expected `{whole}` (the network) or an address without `/`, got `{text}`") from None
+        whole = unmapped(ipaddress.ip_network(text, strict=False))
+    except ValueError:
         raise ValueError(f"Expected an address or a network such as 192.168.0.0/24, got `{text}`") from None
+    try:
+        ipaddress.ip_network(text)
+    except ValueError:
+        raise ValueError(f"Expected `{whole}` (the network) or an address without `/`, got `{text}`") from None
+    return whole
+
+
+def unmapped(network: Network) -> Network:
+    """The IPv4 network within an IPv4-mapped one (RFC 4291, 2.5.5.2); any other one unchanged."""
+    if network.version == 4 or network.prefixlen < _MAPPED_BITS or network.network_address.ipv4_mapped is None:
+        return network
+    return ipaddress.IPv4Network((network.network_address.ipv4_mapped, network.prefixlen - _MAPPED_BITS))
 
 
 def subscription_port(receivers: Sequence[str]) -> int:
@@ -149,9 +160,8 @@ def subscription_port(receivers: Sequence[str]) -> int:
 
 
 def interface_of(bind: str) -> str:
-    """Network interface address in `bind` for multicast datagrams; empty for all addresses, loopback and IPv6."""
-    address = ipaddress.ip_address(bind)
-    return bind if address.version == 4 and not address.is_unspecified and not address.is_loopback else ""
+    """Address in `bind` whose interface multicast datagrams leave by; empty for all addresses."""
+    return "" if ipaddress.ip_address(bind).is_unspecified else bind
 
 
 def is_bus(device: str) -> bool:

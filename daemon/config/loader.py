@@ -18,6 +18,7 @@ from daemon.config.endpoints import AUTO
 from daemon.config.errors import MOVED, Option, Wrong, line_of, options, problems, value_text
 from daemon.config.schema import Config
 from daemon.system.atomic_file import write_whole
+from daemon.system.regular_file import read_named
 
 __all__ = [
     "MOVED",
@@ -51,6 +52,10 @@ All keys with their defaults, ready to paste:
 """
 
 
+MOST_BYTES: Final = 1 << 20
+"""Largest size of a configuration file in bytes."""
+
+
 class ConfigError(Exception):
     """The configuration cannot be used; each line of the text states where, what was expected and the remedy.
 
@@ -72,6 +77,14 @@ def load(file: Path | None, overrides: Sequence[str] = ()) -> Config:
     """
     text = _read(file) if file is not None else ""
     name = str(file) if file is not None else "built-in defaults"
+    try:
+        return _checked(text, name, file, overrides)
+    except RecursionError:
+        raise ConfigError(f"{name}: not valid TOML: nested too deeply") from None
+
+
+def _checked(text: str, name: str, file: Path | None, overrides: Sequence[str]) -> Config:
+    """The configuration in a text of that name; raises `ConfigError`, and `RecursionError` for deep nesting."""
     try:
         tree = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -193,7 +206,7 @@ def reference() -> str:
 
 def _read(file: Path) -> str:
     try:
-        return file.read_bytes().decode()
+        return read_named(file, MOST_BYTES).decode()
     except FileNotFoundError:
         raise ConfigError(f"{file}: no such file (name an existing one, or leave --config out for defaults)") from None
     except UnicodeDecodeError as error:

@@ -18,9 +18,12 @@ import numpy as np
 
 from daemon.config.survey_loader import dump
 from daemon.system.atomic_file import write_whole
+from daemon.system.regular_file import read_regular
 from estimator import ResidualMap, Survey
 
 VERSION: Final = 1
+MOST_BYTES: Final = 256 << 20
+"""Largest size of the file in bytes."""
 _DAMAGE: Final = (
     *(OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError, MemoryError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
@@ -58,7 +61,7 @@ def read_residuals(path: Path, survey: Survey) -> ResidualMap | None:
         ResidualError: damaged, of another version, or learned with another survey.
     """
     try:
-        content = path.read_bytes()
+        content = read_regular(path, MOST_BYTES)
     except FileNotFoundError:
         return None
     except OSError as error:

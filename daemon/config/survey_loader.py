@@ -19,9 +19,12 @@ import msgspec
 from daemon.config.survey_errors import problems
 from daemon.config.survey_schema import SurveyTree
 from daemon.system.atomic_file import write_whole
+from daemon.system.regular_file import read_named
 from estimator import Lamp, Profile, Receiver, Survey
 
 DECIMALS: Final = 6
+MOST_BYTES: Final = 16 << 20
+"""Largest size of a survey in bytes: 100 000 lamps."""
 
 
 class SurveyError(Exception):
@@ -48,6 +51,8 @@ def read_survey(path: Path, profile: Profile | None = None) -> Survey:
     text = _read(path)
     try:
         tree = tomllib.loads(text)
+    except RecursionError:
+        raise SurveyError(f"{path}: not valid TOML: nested too deeply") from None
     except tomllib.TOMLDecodeError as error:
         raise SurveyError(f"{path}: not valid TOML: {error}") from None
     if found := problems(tree, str(path), text, profile):
@@ -123,7 +128,7 @@ def _number(value: float) -> str:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_bytes().decode()
+        return read_named(path, MOST_BYTES).decode()
     except FileNotFoundError:
         raise SurveyError(f"{path}: no such survey (`lumiloop survey` makes one from a drive)") from None
     except UnicodeDecodeError as error:

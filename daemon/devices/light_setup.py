@@ -10,16 +10,21 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
+from daemon.config.residual_file import MOST_BYTES
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError, read_survey, residuals_beside
 from daemon.devices.photodiode import profile_of
+from daemon.system.regular_file import read_regular
 from estimator import PROFILES, Profile, Survey
+
+log = logging.getLogger(__name__)
 
 HEADER: Final = "lights"
 """Key in a recording's head."""
@@ -64,18 +69,27 @@ def load_lights(settings: Config, clock_ppm: float | None = None) -> Lights | No
     survey = read_survey(Path(path), profile) if path else Survey(depth=profile.depth)
     if not settings.photodiode.fitted:
         return None
-    return Lights(survey, profile, clock_ppm, read_residuals(Path(path)) if path else b"")
+    return Lights(survey, profile, clock_ppm, _residuals_or_none(Path(path)) if path else b"")
 
 
 def read_residuals(survey: Path) -> bytes:
     """Content of the residual map beside a survey, empty where there is none; raises `SurveyError`."""
     path = residuals_beside(survey)
     try:
-        return path.read_bytes()
+        return read_regular(path, MOST_BYTES)
     except FileNotFoundError:
         return b""
     except OSError as error:
         raise SurveyError(f"{path}: cannot be read: {error.strerror}; mend that, or move it away") from error
+
+
+def _residuals_or_none(survey: Path) -> bytes:
+    """As :func:`read_residuals`; a map that cannot be read is logged, and the robot drives without it."""
+    try:
+        return read_residuals(survey)
+    except SurveyError as error:
+        log.warning("%s; driving without it", error)
+        return b""
 
 
 def from_header(header: dict[str, Any], folder: Path | None = None) -> Lights | None:

@@ -12,6 +12,7 @@ import logging
 import math
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +20,8 @@ from daemon.config.paths import state_folder
 from daemon.config.schema import PhotodiodeConfig
 from daemon.devices.photodiode import profile_of
 from daemon.system.atomic_file import defect_in, reason_of, write_whole
+from daemon.system.patience import within
+from daemon.system.regular_file import read_regular
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +30,10 @@ MOVED_PPM: Final = 20.0
 """Change in ppm that is written; the decoder tolerates 200 ppm."""
 RETRY_S: Final = 60.0
 CLOSE_S: Final = 1.0
+READ_S: Final = 2.0
+"""Longest wait for the file at the start, s."""
+MOST_BYTES: Final = 1 << 20
+"""Largest size of the file in bytes."""
 
 
 class SampleClock:
@@ -91,7 +98,7 @@ class SampleClock:
 
     def _read(self) -> dict[str, float]:
         try:
-            stored = json.loads(self._path.read_bytes())
+            stored = json.loads(within(READ_S, partial(read_regular, self._path, MOST_BYTES)))
             return {str(key): float(ppm) for key, ppm in stored.items() if self._possible(float(ppm))}
         except FileNotFoundError:
             return {}

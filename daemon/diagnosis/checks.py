@@ -19,6 +19,7 @@ from daemon.config.survey_loader import SurveyError, read_survey
 from daemon.diagnosis.configuration import implausible
 from daemon.diagnosis.host import Heard, Host, Mute, standing
 from daemon.diagnosis.map_folder import Maps, look_at_maps
+from daemon.runtime.warmup import CannotLoad
 from daemon.snapshot import LinkUse, State
 from hal.net.inet import refusal
 
@@ -111,17 +112,23 @@ def clock(case: Case) -> Iterator[Finding]:
 
 
 def cache(case: Case) -> Iterator[Finding]:
-    """Checks for compiled kernels."""
+    """Checks the compiled kernels by loading them."""
     try:
-        warm = case.host.warm(case.settings.photodiode.fitted)
-    except (OSError, RuntimeError) as error:
+        warmth = case.host.warm(case.settings.photodiode)
+    except CannotLoad as error:
         yield fix("kernels", str(error), "give the daemon a folder of its own to write into")
         return
-    if warm:
-        yield good("kernels", "are compiled")
-    else:
+    if warmth is None:
         text = "of this version are not compiled for this user: the first start takes a minute or two"
         yield remark("kernels", text, "run once: lumiloop warm")
+    elif warmth.unwritten:
+        text = f"were missing or damaged, and cannot be stored: {warmth.unwritten}; each start compiles them"
+        yield fix("kernels", text, "make room on that disk, or name another folder with NUMBA_CACHE_DIR")
+    elif warmth.damaged:
+        text = f"{warmth.damaged} of their files were damaged; their kernels have been compiled again"
+        yield remark("kernels", text, "after a power cut that is all; if it comes again, the disk is failing")
+    else:
+        yield good("kernels", f"are compiled, and load in {warmth.seconds:.1f} s")
 
 
 def disk(case: Case) -> Iterator[Finding]:
@@ -309,7 +316,10 @@ def daemon(case: Case) -> Iterator[Finding]:
         return
     present = () if heard.faults is None else heard.faults.present
     for fault in present:
-        yield fix("daemon", f"fault {fault.fault}: {fault.meaning}", fault.remedy)
+        if fault.cause:
+            yield remark("daemon", f"fault {fault.fault} follows from fault {fault.cause}: {fault.meaning}")
+        else:
+            yield fix("daemon", f"fault {fault.fault}: {fault.meaning}", fault.remedy)
     if heard.pose is None:
         yield fix("daemon", f"{heard.name} runs, and tells no pose", "it is starting, or it stands; see its log")
     elif heard.pose.state in (State.TRACKING, State.MAPPING):

@@ -15,9 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from daemon.config.schema import PhotodiodeConfig
 from daemon.health.faults import Fault
 from daemon.publish.stream.client import Stream
 from daemon.publish.stream.messages import Faults, Hello, Lights, NotTheStream, Pose, StateChange
+from daemon.runtime.warmup import Warmth, is_warm, load
 from daemon.snapshot import LinkUse
 from hal.bus import i2c_linux
 from hal.bus.opening import open_bus
@@ -144,15 +146,21 @@ class Host:
                 return error
         return None
 
-    def warm(self, lights: bool) -> bool:
-        """True if the kernels of this version have been compiled here.
+    def warm(self, photodiode: PhotodiodeConfig) -> Warmth | None:
+        """Load the kernels of this version; None if no earlier start has compiled them here.
+
+        A damaged one is compiled again, as at a start.
 
         Raises:
-            OSError, RuntimeError: there is no folder for them.
+            CannotLoad: there is no folder for them, or they cannot be loaded.
         """
-        from daemon.runtime.warmup import is_marked
+        from daemon.devices.light_setup import Lights
+        from daemon.devices.photodiode import profile_of
+        from estimator import Survey
 
-        return is_marked("warm-lights" if lights else "warm")
+        if not is_warm(photodiode.fitted):
+            return None
+        return load(Lights(Survey(), profile_of(photodiode)) if photodiode.fitted else None)
 
     def realtime(self) -> bool:
         """True if the present user may set a real-time priority."""

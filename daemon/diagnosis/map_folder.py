@@ -11,6 +11,7 @@ from typing import Final
 
 from daemon.config.paths import can_be_made, maps_folder
 from daemon.config.schema import Config
+from daemon.system.folder_lock import locked
 
 LOCKS: Final = Path("/proc/locks")
 
@@ -45,7 +46,7 @@ def look_at_maps(settings: Config) -> tuple[Maps, str]:
         return Maps.BROKEN, f"{folder}: maps in it cannot be read by this user"
     from daemon.config.survey_loader import SurveyError  # imports numpy, which no other remark needs
     from daemon.devices.light_setup import load_lights
-    from daemon.maps.store import LOCK, Store, judge_for, unjudged
+    from daemon.maps.store import Store, judge_for, unjudged
 
     store = Store(folder, mend=False)
     try:
@@ -53,8 +54,8 @@ def look_at_maps(settings: Config) -> tuple[Maps, str]:
     except SurveyError:  # reported separately
         judge = unjudged
     start = store.load(judge)
-    unwritten = not settings.map.localise and not _writable(folder, folder / LOCK)
-    other = "" if settings.map.localise else _keeper(folder / LOCK)
+    unwritten = not settings.map.localise and not os.access(folder, os.W_OK | os.X_OK)
+    other = "" if settings.map.localise else _keeper(folder)
     more = "; nothing can be kept in it by this user (fault 403)" if unwritten else ""
     more += f"; {other} keeps its maps there, and no other can (fault 403)" if other else ""
     if start is None:
@@ -67,18 +68,13 @@ def look_at_maps(settings: Config) -> tuple[Maps, str]:
     return Maps.FROZEN if unwritten else Maps.TAKEN if other else Maps.READY, text
 
 
-def _writable(folder: Path, lock: Path) -> bool:
-    """True if this user may store maps in a folder: write into it, and take the present lock."""
-    return os.access(folder, os.W_OK | os.X_OK) and (not lock.exists() or os.access(lock, os.R_OK | os.W_OK))
-
-
-def _keeper(lock: Path) -> str:
+def _keeper(folder: Path) -> str:
     """Returns the holder of the folder's lock as text; empty if there is none."""
     try:
-        with lock.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # released at once: a starting daemon tries again
+        for handle in locked(folder, fcntl.LOCK_SH):  # released at once: a starting daemon tries again
+            os.close(handle)
     except BlockingIOError:
-        about = lock.stat()
+        about = folder.stat()
         named = f"{os.major(about.st_dev):02x}:{os.minor(about.st_dev):02x}:{about.st_ino}"
     except OSError:
         return ""

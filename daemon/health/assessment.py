@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
+from daemon.health.causes import CONSEQUENCES, grouped
 from daemon.health.faults import FAULTS, Fault
 from estimator import SlowError, SlowErrors
 from hal.adc import BusStuck, ChipMissing, Clipping, Dark, Dazzled, NoSignal, WrongChip
@@ -17,6 +18,10 @@ WINDOW_S: Final = 10.0
 """Rates are computed over the latest samples that are at least this far apart (s), or over all available."""
 STALLED_PERIODS: Final = 2.0
 """Delay of the loop, in scan periods, from which the next delay could appear as a lidar without data."""
+WAITED_SHARE: Final = 0.5
+"""Share of a delay of the loop for which other programs must have had the processor to be its cause."""
+CROWDED: Final = 0.1
+"""Share of the time for which the loop waits for the processor, above which input is lost for that reason."""
 FEW: Final = 2
 """Number of events that is no rate yet: shortly after the start, one event would be a large share of all."""
 REPLAYED: Final = frozenset(
@@ -48,7 +53,8 @@ class Vitals:
         blocks, lost, unfit, stalled: counters of blocks. off_rate: clocked outside the decoder's range.
         lamps: faults of lamps and survey.
         cycles, overruns, jobs_failed: counters; short: of cycles without map work or lidar for lack of time.
-        lateness: largest recent delay of the loop, seconds.
+        lateness: largest recent delay of the loop, seconds. waited: counter of seconds for which the loop was ready to
+            run while other programs ran. no_descriptors: hardly any file descriptor is left.
         alert: the protection level exceeds the alert limit, and this has been reported.
         failed: names of components that are down at the moment.
     """
@@ -86,26 +92,46 @@ class Vitals:
     short: int = 0
     jobs_failed: int = 0
     lateness: float = 0.0
+    waited: float = 0.0
+    no_descriptors: bool = False
     alert: bool = False
     failed: frozenset[str] = frozenset()
 
 
 def assess(now: Vitals, before: Vitals) -> tuple[Fault, ...]:
-    """Present faults, gravest first; ``before`` are vitals of about :data:`WINDOW_S` ago."""
+    """Present faults, the gravest cause first, each followed by its consequences (`daemon.health.causes`).
+
+    ``before`` are vitals of about :data:`WINDOW_S` ago.
+    """
     found = [*_lidar(now, before), *_odometry(now, before), *_computer(now, before), *_outputs(now)]
     if now.adc is not None:
         found += [*_photodiode(now, before), *now.lamps]
-    return tuple(sorted(found))
+    if _slow(now, before, frozenset(found)):
+        found.append(Fault.COMPUTER_SLOW)
+    return grouped(found)
 
 
-def describe(fault: Fault, now: Vitals | None = None) -> str:
-    """Log line of a fault: number, meaning, remedy, and the present detail from the driver or the data in ``now``."""
+def describe(fault: Fault, now: Vitals | None = None, before: Vitals | None = None) -> str:
+    """Log line of a fault: number, meaning, remedy, and the present detail.
+
+    The detail is from the driver or the data in ``now``, or from what has changed since ``before``.
+    """
     text, remedy = FAULTS[fault]
     own = now is not None and fault is Fault.LIDAR_REFUSED and now.error is not None and now.error.remedy
     if own:  # the table's remedy is for serial ports and networks; the driver has the one for its device
         remedy = ""
     line = f"fault {int(fault)}: {text} ({remedy})" if remedy else f"fault {int(fault)}: {text}"
+    if fault is Fault.COMPUTER_SLOW and now is not None and before is not None:
+        return f"{line}: {_load(now, before)}"
     return f"{line}: {words}" if now is not None and (words := _words(fault, now)) else line
+
+
+def _load(now: Vitals, before: Vitals) -> str:
+    """Returns what the computer's time went into, between two samples."""
+    cycles, over = now.cycles - before.cycles, now.overruns - before.overruns
+    span = now.t_mono - before.t_mono
+    waited = f"other programs had the processor for {now.waited - before.waited:.1f} of {span:.0f} s"
+    return f"{waited}, {over} of {cycles} cycles were over their budget"
 
 
 def _words(fault: Fault, now: Vitals) -> str:
@@ -226,6 +252,19 @@ def _computer(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.OVERLOADED
     if now.jobs_failed > before.jobs_failed:
         yield Fault.WORKER_FAILED
+    if now.no_descriptors:
+        yield Fault.NO_DESCRIPTORS
+
+
+def _slow(now: Vitals, before: Vitals, found: frozenset[Fault]) -> bool:
+    """Returns True if the computer is too slow: cycles take too long, or the loop has to wait for the processor."""
+    if found & {Fault.OVERRUNS, Fault.OVERLOADED}:
+        return True
+    waited = now.waited - before.waited
+    if Fault.LOOP_STALLED in found and waited >= WAITED_SHARE * now.lateness:
+        return True
+    crowded = waited >= CROWDED * (now.t_mono - before.t_mono) > 0.0
+    return crowded and bool(found & CONSEQUENCES[Fault.COMPUTER_SLOW])
 
 
 STORE: Final = {

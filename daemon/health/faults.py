@@ -50,6 +50,8 @@ class Fault(IntEnum):
     WORKER_FAILED = 303
     OVERLOADED = 304
     PART_FAILED = 305
+    COMPUTER_SLOW = 306
+    NO_DESCRIPTORS = 307
     PUBLISHER_FAILED = 401
     RECORDER_FAILED = 402
     MAP_NOT_SAVED = 403
@@ -181,6 +183,14 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "a part of the daemon has failed and is started again and again",
         "read the log, which names it: is `odometry.port` taken by another program? a defect: please report it",
     ),
+    Fault.COMPUTER_SLOW: (
+        "the computer is too slow for its work, or other programs take its time",
+        "end other programs or move them to another computer; what follows from it is over with it",
+    ),
+    Fault.NO_DESCRIPTORS: (
+        "no file descriptors are left to the daemon, or hardly any",
+        "end clients that keep many connections open, or raise `LimitNOFILE=` of the service (`ulimit -n` in a shell)",
+    ),
     Fault.PUBLISHER_FAILED: (
         "a publisher cannot send or listen",
         "read the log, which names it: is the port, or the stream's socket, taken by another program or daemon? can "
@@ -218,3 +228,8 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
 def describe_over(fault: Fault, seconds: float) -> str:
     """Log line of a fault that is over, with its duration in s."""
     return f"over: fault {int(fault)}: {FAULTS[fault][0]}; it lasted {seconds:.0f} s"
+
+
+def describe_consequence(fault: Fault, cause: Fault) -> str:
+    """Log line of a fault that follows from another one."""
+    return f"fault {int(fault)} follows from fault {int(cause)}: {FAULTS[fault][0]}"

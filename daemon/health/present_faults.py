@@ -9,10 +9,10 @@ from daemon.health.faults import Fault
 
 @dataclass(slots=True)
 class PresentFaults:
-    """Present faults, gravest first."""
+    """Present faults, the gravest cause first, each followed by its consequences (`daemon.health.causes`)."""
 
     faults: tuple[Fault, ...] = ()
 
     def gravest(self) -> int:
-        """Number of the gravest present fault, 0 for none."""
+        """Number of the gravest present cause, 0 for none."""
         return int(self.faults[0]) if self.faults else 0

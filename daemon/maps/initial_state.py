@@ -5,20 +5,26 @@ from __future__ import annotations
 import hashlib
 import logging
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from daemon.config.paths import maps_folder
 from daemon.config.schema import MapConfig
 from daemon.devices.light_setup import Lights
-from daemon.maps.container import Damaged
+from daemon.maps.container import MOST_BYTES, Damaged
 from daemon.maps.schema import read
 from daemon.maps.store import Start, Store, judge_for
+from daemon.system.patience import within
+from daemon.system.regular_file import read_regular
 
 if TYPE_CHECKING:  # the warm-up loads the estimator in a thread
     from estimator import LightsSetup, ResidualMap, Settings, State
 
 log = logging.getLogger(__name__)
+
+MAPS_S: Final = 60.0
+"""Longest wait for the folder of maps at the start, s."""
 
 
 class CannotBegin(Damaged):
@@ -116,13 +122,36 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
     return store, start
 
 
+def started_in_time(config: MapConfig, lights: Lights | None) -> tuple[Store | None, Start | None]:
+    """As :func:`started`, on a disk that may not answer: after a minute the run goes on without the stored map.
+
+    Raises:
+        NoMap: the configuration requires a stored map, and none can be used.
+    """
+
+    def unlock(found: tuple[Store | None, Start | None]) -> None:
+        if found[0] is not None:
+            found[0].close()
+
+    try:
+        return within(MAPS_S, partial(started, config, lights), unlock)
+    except TimeoutError as error:
+        folder = maps_folder(config.folder)
+        if config.localise:
+            raise NoMap(f"{folder}: {error.strerror}, and `map.localise` is true") from error
+        log.error("maps in %s cannot be read: %s; a new one is begun", folder, error.strerror)
+        store = Store(folder)
+        store.damaged = True
+        return store, None
+
+
 def recorded_start(path: Path, sha256: str, lights: Lights | None, localise: bool = False) -> Start:
     """The initial map of a recorded run, from the recording's folder.
 
     Raises:
         OSError: it cannot be read. BadMap: it is not the one with which the run started, or is damaged.
     """
-    content = path.read_bytes()
+    content = read_regular(path, MOST_BYTES)
     if hashlib.sha256(content).hexdigest() != sha256:
         raise Damaged(f"{path.name} is not the map that the recorded run began with")
     stored = read(content)

@@ -10,23 +10,29 @@ present anyway to switch the robot on.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import math
 import os
+import stat
 import struct
 import threading
 import time
 import zlib
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from daemon.snapshot import GUESSED, Snapshot, State
 from daemon.system.atomic_file import defect_in, reason_of, sync_folder
+from daemon.system.patience import within
+from daemon.system.regular_file import read_regular
 
 log = logging.getLogger(__name__)
 
 FILE: Final = "last-pose"
+ASIDE: Final = ".broken"
 MOVED_M: Final = 0.02
 MOVED_RAD: Final = 0.01
 """Smallest change in rad that is written."""
@@ -34,6 +40,10 @@ WRITE_S: Final = 0.2
 SYNC_S: Final = 10.0
 RETRY_S: Final = 5.0
 CLOSE_S: Final = 1.0
+READ_S: Final = 2.0
+"""Longest wait for the file at the start, s."""
+MOST_BYTES: Final = 4096
+"""Largest size of the file in bytes; later versions may append slots."""
 SURE: Final = (State.TRACKING, State.DEGRADED)
 
 Pose = tuple[float, float, float]
@@ -80,7 +90,7 @@ def unpacked(slot: bytes) -> Remembered | None:
 def read(path: Path) -> Remembered | None:
     """The latest complete slot; None where there is none. An unreadable file is logged and ignored."""
     try:
-        content = path.read_bytes()[: 2 * _SLOT_BYTES]
+        content = within(READ_S, partial(read_regular, path, MOST_BYTES))[: 2 * _SLOT_BYTES]
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
@@ -94,6 +104,18 @@ def _may_write(folder: Path) -> bool:
     """Whether files can be created in a folder, or in the nearest one that exists."""
     there = next((one for one in (folder, *folder.parents) if one.exists()), folder)
     return os.access(there, os.W_OK)
+
+
+def _opened(path: Path) -> int:
+    """File descriptor of the file for writing; what is no regular file is replaced.
+
+    Raises:
+        OSError: it cannot be opened or created.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        if not stat.S_ISREG(path.lstat().st_mode):
+            path.replace(path.with_name(path.name + ASIDE))
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
 
 
 class LastPose:
@@ -205,11 +227,15 @@ class LastPose:
             self.busy_since = None
 
     def _write(self, told: Remembered) -> None:
+        if self._file >= 0 and os.fstat(self._file).st_nlink == 0:  # deleted meanwhile
+            self._close()
         if self._file < 0:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            self._file = _opened(self.path)
             sync_folder(self.path.parent)
-        os.pwrite(self._file, packed(told), _SLOT_BYTES * (told.number % 2))
+        slot, at = packed(told), _SLOT_BYTES * (told.number % 2)
+        if os.pwrite(self._file, slot, at) < len(slot):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._unsynced = told
 
     def _close(self) -> None:

@@ -14,15 +14,24 @@ from __future__ import annotations
 
 import contextlib
 import json
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import msgspec
+from msgspec.structs import replace
 
 from daemon.system.atomic_file import write_whole
+from daemon.system.regular_file import read_regular
 
 NAME: Final = "starts"
 """Name of the JSON file with the counts, in the folder of maps."""
 MOST: Final = 3
+MOST_STARTS: Final = 1 << 31
+"""Largest plausible count."""
+MOST_OUT: Final = 1000
+"""Largest number of excluded files."""
+MOST_BYTES: Final = 1 << 20
+"""Largest size of the file in bytes."""
 PROOF_S: Final = 10.0
 """Time in s since loading the map after which the map cannot be the cause of a failure."""
 BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
@@ -32,8 +41,11 @@ LEFT_OUT: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class StartAttempts:
+Count = Annotated[int, msgspec.Meta(ge=0, le=MOST_STARTS)]
+FileName = Annotated[str, msgspec.Meta(pattern=r"^[^/]*\.lumimap\Z")]
+
+
+class StartAttempts(msgspec.Struct, frozen=True):
     """Content of the file.
 
     Attributes:
@@ -43,8 +55,8 @@ class StartAttempts:
 
     boot: str = ""
     of: str = ""
-    count: int = 0
-    out: tuple[str, ...] = ()
+    count: Count = 0
+    out: Annotated[tuple[FileName, ...], msgspec.Meta(max_length=MOST_OUT)] = ()
 
 
 class StartTrial:
@@ -63,9 +75,8 @@ class StartTrial:
         """Read the counts of earlier starts since the computer was switched on."""
         boot = _boot()
         try:
-            told = json.loads(self._path.read_text(encoding="ascii"))
-            before = StartAttempts(str(told["boot"]), str(told["of"]), int(told["count"]), tuple(map(str, told["out"])))
-        except (OSError, ValueError, KeyError, TypeError):
+            before = msgspec.convert(json.loads(read_regular(self._path, MOST_BYTES)), StartAttempts)
+        except (OSError, ValueError, RecursionError):  # ValueError: not JSON, or other values than declared
             before = StartAttempts()
         self._told = before if before.boot == boot else StartAttempts(boot)
         self.out = self._told.out
@@ -103,7 +114,7 @@ class StartTrial:
 
     def _wrote(self, told: StartAttempts) -> bool:
         try:
-            write_whole(self._path, json.dumps(asdict(told)).encode())
+            write_whole(self._path, json.dumps(msgspec.to_builtins(told)).encode())
         except OSError:
             return False
         self._told = told

@@ -7,16 +7,17 @@ with the suffix ``.broken``; the newest few of these stay.
 Of the map in use, the store keeps the two newest generations, of which one may fail. It also keeps the one with which
 this run started. That one is the last that a whole run has confirmed, should this run spoil the map. Of every other map
 (RESET starts one, and each building has its own) the newest good generation is kept, of the seven latest maps. A file
-is deleted only after a newer one has been read.
+is deleted only after it and the newer ones that replace it have been read (`daemon.maps.generations`). A file that
+cannot be read now counts as no generation and stays.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
 import os
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
@@ -24,21 +25,34 @@ from pathlib import Path
 from typing import Final
 
 from daemon.devices.light_setup import Lights
-from daemon.maps.container import BadMap, Damaged, Foreign
-from daemon.maps.generations import BROKEN, BROKEN_NAME, NAME, Generation, newest_number, said, verify
+from daemon.maps.container import MOST_BYTES, BadMap, Damaged, Foreign
+from daemon.maps.generations import (
+    BROKEN,
+    BROKEN_NAME,
+    CROWDED,
+    NAME,
+    Examination,
+    Generation,
+    Problem,
+    newest_number,
+    problem_of,
+    said,
+    superfluous,
+    verify,
+    words_of,
+)
 from daemon.maps.schema import OtherBuilding, Stored, against_survey, read
 from daemon.maps.start_trial import LEFT_OUT, MOST, StartTrial
 from daemon.system.atomic_file import sync_folder, write_whole
+from daemon.system.folder_lock import FolderLock
+from daemon.system.regular_file import read_regular
 
 log = logging.getLogger(__name__)
 
-LOCK: Final = "lock"
 MOST_BROKEN: Final = 8
 """Number of files kept for diagnosis that a failing disk has damaged during a save."""
 START: Final = "start.lumimap"
 """File name of the initial map in a recording's folder."""
-NEWEST: Final = 2
-OTHERS: Final = 7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,8 +100,8 @@ class Store:
         self._mend = mend
         self.damaged = self.left_out = False
         self._origin: Path | None = None
-        self._good: dict[Path, bool] = {}
-        self._lock: int | None = None
+        self._examined = Examination()
+        self._lock = FolderLock(folder)
         self.trouble = ""
         self.trial: Final = StartTrial(folder)
 
@@ -130,12 +144,12 @@ class Store:
         A file with a name of the operator's choice is no generation of anything: where it is damaged, the next one
         counts.
         """
-        if self._lock is not None:
+        if self._lock.held:
             self.trial.read()
         while True:
             start, before = self._newest(judge), self.trial.out
             name = self._origin.name if start is not None and self._origin is not None else ""
-            if self._lock is None or not self.trial.changes(name):
+            if not self._lock.held or not self.trial.changes(name):
                 return start
             if not self.trial.out:
                 them = ", ".join(before)
@@ -166,7 +180,7 @@ class Store:
                     start = self._read(generation, judge)
                 except OtherBuilding as error:
                     self._refuse(generation.path, error)
-                except (BadMap, OSError) as error:
+                except (BadMap, OSError, MemoryError) as error:
                     self._refuse(generation.path, error)
                     elsewhere, refused = not generation.number, True  # a file placed by the operator is no generation
                 else:
@@ -187,7 +201,7 @@ class Store:
 
     def lasted(self) -> None:
         """Record that this run has lasted: its excluded files are moved aside, all others count as good."""
-        if self._lock is None:
+        if not self._lock.held:
             return
         for name in self.trial.lasted():
             with contextlib.suppress(OSError):
@@ -207,6 +221,7 @@ class Store:
                     start = self._read(generation, judge)
                 except (BadMap, OSError) as error:
                     log.error("%s is refused: %s", generation.path, error)
+                    self._examined.found(generation.path, error)
                     failure = error
                 else:
                     self._origin = generation.path
@@ -214,8 +229,9 @@ class Store:
         raise failure
 
     def _read(self, generation: Generation, judge: Judge) -> Start:
-        content = generation.path.read_bytes()
+        content = read_regular(generation.path, MOST_BYTES)
         stored = read(content)
+        self._examined.found(generation.path, None)
         if generation.number and stored.meta.map_id != generation.map_id:
             raise Foreign(f"it holds map {stored.meta.map_id:08x}, another than its name says")
         words, changed = judge(stored)
@@ -244,11 +260,12 @@ class Store:
             return aside if aside.exists() else path
         return path
 
-    def _refuse(self, path: Path, error: BadMap | OSError) -> None:
+    def _refuse(self, path: Path, error: Problem) -> None:
         """Log why a file is not used; a damaged one is moved aside."""
         self.damaged = True
-        if isinstance(error, OSError):
-            log.error("%s cannot be read: %s; mend that, or move it away", path, said(error))
+        self._examined.found(path, error)
+        if not isinstance(error, BadMap):
+            log.error("%s cannot be read: %s; it stays; mend that, or move it away", path, words_of(error))
             return
         where = path
         if self._mend and isinstance(error, Damaged | Foreign):
@@ -273,33 +290,34 @@ class Store:
             path.replace(path.with_name(path.name + BROKEN))
             self._drop_broken()
             raise
+        self._examined.found(path, None)
         self._let_go(map_id)
         return path
 
     def _drop_broken(self) -> None:
-        """Delete all but the newest damaged files: with a failing disk they would fill it up."""
+        """Delete the oldest of many damaged files: with a failing disk they would fill it up.
+
+        A good one was moved aside for another reason, and stays.
+        """
         found = [(int(match[2]), path) for path in self.folder.iterdir() if (match := BROKEN_NAME.fullmatch(path.name))]
         for _, path in sorted(found)[:-MOST_BROKEN]:
-            log.warning("%s goes: %d damaged maps are newer", path, MOST_BROKEN)
-            path.unlink(missing_ok=True)
+            if isinstance(problem_of(path), Damaged):
+                log.warning("%s goes: %d damaged maps are newer", path, MOST_BROKEN)
+                path.unlink(missing_ok=True)
 
     def _use(self) -> None:
         """Create and lock the folder if necessary; temporary files of a killed process are deleted."""
-        if self._lock is None or not self.folder.is_dir():
-            self._take()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self._lock.take():
+            try:
+                tempfile.TemporaryFile(dir=self.folder).close()  # raises the reason why nothing can be saved
+            except OSError:
+                self._lock.close()
+                raise
+            self._drop_parts()
         self.trouble = ""
 
-    def _take(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(lock)
-            raise
-        if self._lock is not None:
-            os.close(self._lock)
-        self._lock = lock
+    def _drop_parts(self) -> None:
         for part in self.folder.glob(".map-*.part"):
             try:
                 part.unlink(missing_ok=True)
@@ -312,51 +330,14 @@ class Store:
         return 1 + max(numbers, default=0)
 
     def _let_go(self, map_id: int) -> None:
-        for generation in self._superfluous(map_id):
-            log.info("%s goes: an older generation", generation.path)
-            generation.path.unlink(missing_ok=True)
-        sync_folder(self.folder)
-
-    def _superfluous(self, map_id: int) -> Iterator[Generation]:
-        """Generations that newer files replace: of this map the verified one, of others one that has been read."""
-        others: dict[int, list[Generation]] = {}
-        mine = 0
-        for generation in self.generations():
-            if generation.number == 0:
-                continue
-            if generation.map_id != map_id:
-                others.setdefault(generation.map_id, []).append(generation)
-                continue
-            mine += 1
-            if mine > NEWEST and generation.path != self._origin:
-                yield generation
-        for files in others.values():
-            if len(files) > 1:
-                yield from files[1 + self._newest_good(files) :]
-        if len(others) > OTHERS:
-            usable = [files for files in others.values() if self._newest_good(files) < len(files)]
-            for files in usable[OTHERS:]:
-                log.warning("%s goes: %d maps of other places are newer", files[0].path, OTHERS)
-                yield from files[: 1 + self._newest_good(files)]
-
-    def _newest_good(self, files: list[Generation]) -> int:
-        """Index of the first generation of one map that can be read; their number where none can."""
-        return next((place for place, generation in enumerate(files) if self._is_good(generation)), len(files))
-
-    def _is_good(self, generation: Generation) -> bool:
-        """Whether a file can be read; the result is cached, because maps are large."""
-        if generation.path not in self._good:
+        for generation, why in list(superfluous(self.generations(), map_id, self._origin, self._examined)):
+            log.log(logging.WARNING if why == CROWDED else logging.INFO, "%s goes: %s", generation.path, why)
             try:
-                read(generation.path.read_bytes())
-            except (BadMap, OSError) as error:
-                log.warning("%s cannot be used: %s; the generation before it is kept", generation.path, error)
-                self._good[generation.path] = False
-            else:
-                self._good[generation.path] = True
-        return self._good[generation.path]
+                generation.path.unlink(missing_ok=True)
+            except OSError as error:
+                log.warning("%s cannot be deleted: %s; it is left there", generation.path, said(error))
+        sync_folder(self.folder)
 
     def close(self) -> None:
         """Unlock the folder; idempotent."""
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+        self._lock.close()

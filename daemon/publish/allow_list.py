@@ -6,13 +6,13 @@ protect against an attacker who can forge addresses on the network.
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final
 
 from daemon.config.endpoints import parse_network
+from hal.net.peers import parse_peer
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ class Access:
 
     def _look(self, host: str) -> bool:
         try:
-            address = ipaddress.ip_address(host.partition("%")[0])
+            address = parse_peer(host)
         except ValueError:
             return False
         return address.is_loopback or any(address in network for network in self._networks)

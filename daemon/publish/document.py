@@ -106,6 +106,8 @@ unless `bind` does, and on a serial line (RTU) where `modbus.serial` names one. 
 **{registers.BLOCK_WORDS} input registers from address 0 in one request** (function 4; function 3 shows the same): the
 answer is one snapshot, whole, of the last cycle. It is not a safety function.
 
+* Function 43 with MEI type 14 (read device identification) names program, version and, as user application name, the
+  robot: regular objects 0 to 6, by stream or each alone.
 * Addresses are the protocol's, from 0. Tools that count from 1 call the first register 30001 (function 4) or 40001.
 * Big-endian: high byte first within a register, **high word first** in 32- and 64-bit values.
 * On UDP and TCP any unit identifier is answered, on a serial line only ours. Over UDP, one datagram is one request;
@@ -238,8 +240,9 @@ def _writing() -> str:
     head = ("address", "name", "type", "access", "step", "not known", "meaning")
     return f"""## Writing: holding registers
 
-Only with `modbus.write = true`; otherwise every write is answered with exception 1. Functions 6 and 16; function 3
-reads back. Whoever is answered can write.
+Only with `modbus.write = true`; otherwise every write is answered with exception 1. Functions 6, 16 and 23; function 3
+reads back. Function 23 writes first and then reads any of the tables; where either is impossible, nothing is written.
+Whoever is answered can write.
 
 ### Command block, {holding.COMMAND_ADDRESS} to {holding.COMMAND_ADDRESS + holding.COMMAND.words - 1}
 
@@ -273,11 +276,16 @@ def _limits() -> str:
     rows = [
         ("registers in one read", str(requests.MAX_READ), "exception 3"),
         ("registers in one write", str(requests.MAX_WRITE), "exception 3"),
+        ("registers written in one request that reads too", str(requests.MAX_READ_WRITE), "exception 3"),
         ("address outside the tables", "", "exception 2"),
         ("any other function", "", "exception 1"),
         ("an error of the daemon's own, which its log tells", "", "exception 4"),
         ("TCP connections", str(counts.MAX_CONNECTIONS),
-         f"the longest idle is dropped if idle for {tcp_endpoint.EVICT_S:g} s, else the new one"),
+         f"the longest idle is dropped if idle for {tcp_endpoint.EVICT_S:g} s, else one of the host with the most, if "
+         "that has more than the new one's, else the new one"),
+        ("TCP connections of one host", str(counts.PER_HOST),
+         f"its longest idle is dropped if idle for {tcp_endpoint.EVICT_S:g} s, else the new one; an IPv6 /64 network "
+         "is one host"),
         ("TCP without a request", f"{tcp_endpoint.IDLE_S:g} s", "closed"),
         ("TCP request not completed", f"{tcp_endpoint.PARTIAL_S:g} s", "closed"),
         ("TCP answers not read", f"{tcp_endpoint.STUCK_S:g} s", "closed"),

@@ -32,8 +32,10 @@ def udp_page() -> str:
 ## Pose datagrams
 
 After each cycle the daemon sends one datagram to every `pose.receivers` entry: a computer (`192.168.0.20:5600`), a
-multicast group (`239.255.0.7:5600`; it stays on the local network, and leaves by the interface whose address `bind`
-is), or whoever subscribes (`*:5601`, see below). Little-endian, every value naturally aligned, CRC-32 as in zlib and
+multicast group (`239.255.0.7:5600`), or whoever subscribes (`*:5601`, see below). Datagrams to a group stay on the
+local network. They leave by the interface whose address `bind` is, so with 127.0.0.1 they stay on this computer; with
+0.0.0.0 or `::` by the one that the system's routes name; an IPv6 group may name its own (`[ff15::42%eth0]:5600`). The
+loopback interface has no IPv6 groups. Little-endian, every value naturally aligned, CRC-32 as in zlib and
 IEEE 802.3. Nothing is repeated: a lost datagram is followed by a newer one. Readers go by `length`: a
 later version of the program may append values under the same `version` number. A reference reader in C is
 `tools/clients/listen_pose.c`.

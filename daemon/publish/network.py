@@ -95,6 +95,7 @@ class Network:
 
         modbus = ModbusPublisher(
             self._clock,
+            name=self._settings.name,
             write=settings.write,
             allowed=self._access,
             on_command=lambda request: orders.handle(request),

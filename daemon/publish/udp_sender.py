@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -19,9 +20,12 @@ from daemon.publish.udp_subscriptions import Subscriptions
 from daemon.snapshot import Snapshot
 from hal.errors import DeviceMissing
 from hal.net import inet
+from hal.net.interfaces import interface_of
 
 RETRY_S: Final = 5.0  # of a failed name lookup: the network often starts after the robot's programs
 REFRESH_S: Final = 300.0  # a name's address may move to another computer
+
+_MREQN: Final = struct.Struct("@4s4si")  # ip_mreqn (ip(7)): group, own address, interface
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +53,7 @@ class PoseSender:
 
     Args:
         receivers: as `daemon.config.endpoints.parse_endpoint` accepts them.
-        interface: address of this computer from which multicast is sent; empty: the system's route.
+        interface: address of this computer by whose interface multicast leaves; empty: the system's route.
         subscriptions: present subscribers; None: no subscriptions.
 
     Raises:
@@ -62,7 +66,7 @@ class PoseSender:
         self.receivers = [Receiver(text, *parse_endpoint(text)) for text in receivers]
         self._interface = interface
         self._subscriptions = subscriptions
-        self._sockets: dict[tuple[socket.AddressFamily, int], socket.socket] = {}  # by network interface
+        self._sockets: dict[tuple[socket.AddressFamily, str | int], socket.socket] = {}
         self._lookups: list[asyncio.Task[None]] = []
 
     async def start(self) -> None:
@@ -103,7 +107,7 @@ class PoseSender:
         if receiver.address is None:
             receiver.dropped += 1
             return
-        kind = receiver.address[0], inet.scope(receiver.address)
+        kind = receiver.address[0], self._way(receiver.address)
         sock = self._sockets.get(kind)
         try:
             if sock is None:
@@ -113,6 +117,8 @@ class PoseSender:
             receiver.dropped += 1
         except OSError as error:
             receiver.dropped += 1
+            if kind[1] and (failed := self._sockets.pop(kind, None)) is not None:
+                failed.close()  # its interface may have come back with another number
             self._lost(receiver, error.strerror or str(error))
         else:
             receiver.sent += 1
@@ -120,14 +126,21 @@ class PoseSender:
                 receiver.reachable = True
                 log.info("pose receiver %s can be reached again", receiver.name)
 
-    def _open(self, family: socket.AddressFamily, interface: int) -> socket.socket:
-        """Open a socket for sending; multicast uses the given interface."""
+    def _way(self, address: inet.Address) -> str | int:
+        """By what a datagram leaves: the number of its network interface, or an own address; empty: the route."""
+        return inet.scope(address) or (self._interface if inet.is_group(address) else "")
+
+    def _open(self, family: socket.AddressFamily, way: str | int) -> socket.socket:
+        """Open a socket for sending; multicast leaves by ``way``, see :meth:`_way`. Raises OSError."""
         sock = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         try:
-            if family == socket.AF_INET and self._interface:
-                sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._interface))
-            elif family == socket.AF_INET6 and interface:
-                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, interface)
+            index = way if isinstance(way, int) else interface_of(way) if way else 0
+            if index and family == socket.AF_INET6:
+                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, index)
+            elif index:
+                own = way if isinstance(way, str) and ":" not in way else "0.0.0.0"
+                request = _MREQN.pack(bytes(4), socket.inet_aton(own), index)
+                sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, request)
         except OSError:
             sock.close()
             raise

@@ -25,6 +25,7 @@ from typing import Any, Final
 from daemon.system.logging import Sparing
 from hal.net import inet
 from hal.net.fair_share import Reader, Share
+from hal.net.peers import full_for
 from hal.net.reply_address import PACKET_INFO_SPACE, ReplySource, enable_packet_info, reply_source, send_from
 
 MAGIC: Final = b"LUSB"
@@ -84,10 +85,17 @@ def decode(data: bytes) -> Message:
     return Message(Status(status), lease, cookie)
 
 
+def peer_host(peer: Any) -> str:
+    """Address of the host of a peer: see :class:`Leases`."""
+    (host, *_), _ = peer
+    return str(host)
+
+
 class Leases:
     """Subscribers with the end of their leases. Pure: the time is an argument, and nothing is sent.
 
-    A peer is a hashable key: the client's address, and our address to which it sent.
+    A peer is a hashable key: the client's socket address, and our address to which it sent. One host has only a share
+    of the places (`hal.net.peers`).
 
     Attributes:
         refused: requests rejected because the largest number of subscribers was reached.
@@ -111,12 +119,16 @@ class Leases:
             self._until.pop(peer, None)
             return Message(Status.ENDED, 0, message.cookie)
         self._expire(now)
-        if peer not in self._until and len(self._until) >= SUBSCRIBERS:
+        if peer not in self._until and (len(self._until) >= SUBSCRIBERS or self._greedy(peer)):
             self.refused += 1
             return Message(Status.FULL, 0, message.cookie)
         lease = min(message.lease, LONGEST_LEASE_S)
         self._until[peer] = now + lease
         return Message(Status.GRANTED, lease, self._cookie(peer, now))
+
+    def _greedy(self, peer: Any) -> bool:
+        """Whether the peer's host has its share of the places."""
+        return full_for(peer_host(peer), map(peer_host, self._until), SUBSCRIBERS)
 
     def peers(self, now: float) -> list[Any]:
         """Peers with a valid lease."""

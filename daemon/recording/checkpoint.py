@@ -1,14 +1,13 @@
-"""Writer of checkpoints: captures the estimator state within a cycle and pickles it later.
+"""Writer of checkpoints: captures the estimator state within a cycle, and describes it by the schema later.
 
 A replay of a dump starts from such a checkpoint. The capture must not delay the cycle, however large the map is. It
-therefore has two parts. Small values that change all the time are pickled at once (:func:`capture`). Large objects
-never change once they exist (keyframes, finished submaps, patches). The capture only refers to them, and another
-thread pickles them later, one piece at a time (:meth:`Taken.pieces`). Submaps are few and do change, so the values of
-their fields are copied at once.
+therefore has two parts. Small values that change all the time are copied at once (:func:`capture`). Large objects never
+change once they exist (keyframes, finished submaps, patches). The capture only refers to them. Submaps are few and do
+change, so the values of their fields are copied at once. Another thread makes the nodes of the schema from all of
+these, one after the other (:meth:`Taken.nodes`).
 
-Pending jobs are nested functions with the variables that they capture. They are stored by name
-(:func:`daemon.recording.restore.function_within`) and rebuilt from the same source line of the same software version.
-`daemon.recording.restore` reads what this module writes.
+The copy is made by pickle, the fastest copier of Python, and stays in this process. `daemon.recording.state_schema` has
+the format of the file, `daemon.recording.restore` reads it.
 """
 
 from __future__ import annotations
@@ -16,29 +15,42 @@ from __future__ import annotations
 import io
 import pickle
 import types
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from enum import Enum
+from functools import partial
 from operator import attrgetter
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 from weakref import WeakSet
 
-from daemon.recording.restore import (
-    FIXED,
-    ROOT,
-    WHOLE,
-    Piece,
-    blank,
-    field_names,
-    fill,
-    function_within,
-    piece_of,
-    weak_set,
+import numpy as np
+
+from daemon.recording.state_schema import (
+    CONTAINERS,
+    PLAIN,
+    Array,
+    Blob,
+    Call,
+    Kind,
+    Many,
+    Member,
+    Node,
+    Record,
+    Ref,
+    Table,
+    UnknownName,
+    Value,
+    fields_of,
+    is_enumeration,
+    is_named_tuple,
+    name_of,
 )
 from estimator import (
     Keyframe,
     MapState,
     MatchMemory,
+    Patch,
     ResidualMap,
     SearchedAside,
     Settled,
@@ -49,59 +61,51 @@ from estimator import (
 )
 
 PROTOCOL: Final = 5
+_SCALARS: Final = frozenset((type(None), bool, float, str))
+_LEAST, _MOST = -(1 << 63), 1 << 64
+"""Range of the integers that a file holds."""
 
 
 class CannotTake(Exception):
     """Part of the state cannot be stored; this is a defect, and the text names the part."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Ref:
-    """Reference to a piece by its number."""
-
-    number: int
-
-
 class Taken:
-    """A captured state: the small values pickled, the large pieces referenced."""
+    """A captured state: the small values copied, the large objects referenced."""
 
     def __init__(self) -> None:
-        self._pieces: list[object] = []  # kept alive to the end: numbers are looked up by identity
+        self._held: list[object] = []  # kept alive to the end: numbers are looked up by identity
         self._numbers: dict[int, int] = {}
-        self._said: dict[int, tuple[Any, ...]] = {}  # fields of submaps at the time of the capture
-        self._root = b""
-        self._late = False
+        self._submaps: dict[int, tuple[Any, ...]] = {}  # fields of submaps at the time of the capture
+        self._copy = b""
 
-    def hold(self, piece: object) -> _Ref:
-        """Returns the reference to a piece; adds the piece at its first use."""
-        number = self._numbers.get(id(piece))
+    def hold(self, one: object) -> int:
+        """Returns the number of an object that is referenced; adds it at its first use."""
+        number = self._numbers.get(id(one))
         if number is None:
-            if isinstance(piece, Submap):
-                self.hold_all([piece])
-                return self.hold(piece)
-            number = self._numbers[id(piece)] = len(self._pieces)
-            self._pieces.append(piece)
-            if not self._late:  # capture the submaps that it refers to before they change
-                if isinstance(piece, Keyframe):
-                    self.hold(piece.submap)
-                elif isinstance(piece, Settled):
-                    self.hold(piece.witness.submap)
-        return _Ref(number)
+            if isinstance(one, Submap):
+                self.hold_all([one])
+                return self._numbers[id(one)]
+            number = self._numbers[id(one)] = len(self._held)
+            self._held.append(one)
+            if isinstance(one, Keyframe):  # capture the submaps that it refers to before they change
+                self.hold(one.submap)
+            elif isinstance(one, Settled):
+                self.hold(one.witness.submap)
+        return number
 
     def hold_all(self, submaps: Iterable[Submap]) -> None:
         """Adds submaps, and the submaps that they refer to, with their present field values."""
-        numbers, pieces, said = self._numbers, self._pieces, self._said
+        numbers, held, values = self._numbers, self._held, self._submaps
         waiting = list(submaps)
         while waiting:
             submap = waiting.pop()
             if id(submap) in numbers:
                 continue
-            if self._late:
-                raise CannotTake(f"submap {submap.key} was not there when the state was taken")
-            number = numbers[id(submap)] = len(pieces)
-            pieces.append(submap)
+            numbers[id(submap)] = len(held)
+            held.append(submap)
             hung = tuple(submap.hung) if len(submap.hung) else ()
-            said[number] = *_of_submap(submap), hung
+            values[id(submap)] = *_of_submap(submap), hung
             waiting += hung
             if submap.into is not None:
                 waiting.append(submap.into[0])
@@ -109,46 +113,33 @@ class Taken:
                 waiting.append(submap.settled.witness.submap)
 
     def seal(self, root: object) -> None:
-        """Pickles the small values; called once."""
-        self._root = _pickled(root, self)
-        self._late = True
+        """Copies the small values; called once."""
+        file = io.BytesIO()
+        _Copier(file, self).dump(root)
+        self._copy = file.getvalue()
 
-    def pieces(self) -> Iterator[Piece]:
-        """Yields every piece in pickled form, the root last; may run in another thread while the daemon continues."""
-        number = 0
-        while number < len(self._pieces):  # pieces refer to more pieces
-            piece = self._pieces[number]
-            kind = type(piece)
-            yield Piece(number, f"{kind.__module__}:{kind.__qualname__}", self._content(piece, number))
-            number += 1
-        yield Piece(ROOT, "", self._root)
+    @property
+    def copied_bytes(self) -> int:
+        """Size of the small values that were copied."""
+        return len(self._copy)
 
-    def _content(self, piece: object, number: int) -> bytes:
-        if isinstance(piece, WHOLE):
-            return pickle.dumps(piece, PROTOCOL)
-        if isinstance(piece, dict):
-            return _pickled(_Dict(piece), self)
-        if isinstance(piece, Submap):
-            return _pickled(dict(zip(_SUBMAP, self._said[number], strict=True)), self)
-        return _pickled(_fields_of(piece), self)
+    def nodes(self) -> Iterator[Node]:
+        """Yields every node; may run in another thread while the daemon continues.
+
+        Raises:
+            CannotTake: some part belongs into no state.
+        """
+        root = _Original(io.BytesIO(self._copy), self._held).load()
+        return _Describer(self._submaps).nodes(root)
+
+
+class _Weak(tuple[object, ...]):
+    """Elements of a `WeakSet`, which keep their order."""
 
 
 _SUBMAP: Final = (*(field.name for field in fields(Submap) if field.name != "hung"), "hung")
 _of_submap: Final = attrgetter(*_SUBMAP[:-1])
-
-
 _submap_of: Final = attrgetter("submap")
-
-
-class _Dict(NamedTuple):
-    """A dict that is a piece of its own; the wrapper keeps the pickler from replacing it by a reference to itself."""
-
-    content: dict[Any, Any]
-
-
-def _fields_of(piece: object) -> dict[str, Any]:
-    kind: type = type(piece)
-    return {name: getattr(piece, name) for name in field_names(kind)}
 
 
 def capture(state: State, rest: dict[str, object]) -> Taken:
@@ -157,7 +148,7 @@ def capture(state: State, rest: dict[str, object]) -> Taken:
     The duration grows with the number of submaps and keyframes; docs/replay.md has figures.
 
     Raises:
-        CannotTake: some part cannot be pickled.
+        CannotTake: some part cannot be copied.
     """
     taken = Taken()
     taken.hold_all(set(map(_submap_of, state.map.keyframes.values())).union(state.map.graph.submaps.values()))
@@ -170,83 +161,217 @@ def capture(state: State, rest: dict[str, object]) -> Taken:
     return taken
 
 
-class _Writer(pickle.Pickler):
-    """Pickler that writes references in place of pieces."""
+# the copy within this process
+
+
+def held(number: int) -> object:
+    """Placeholder in the copy for an object that is referenced; never called."""
+    raise AssertionError("referenced objects are looked up by number")
+
+
+def blank(kind: type) -> object:
+    """Returns an object with its fields not yet set."""
+    return object.__new__(kind)
+
+
+def fill(made: object, said: dict[str, Any]) -> None:
+    """Sets the fields of an object."""
+    for name, value in said.items():
+        object.__setattr__(made, name, value)
+
+
+class _Copier(pickle.Pickler):
+    """Pickler that writes references in place of large objects."""
 
     def __init__(self, file: io.BytesIO, taken: Taken) -> None:
         super().__init__(file, PROTOCOL)
         self._taken = taken
 
     def reducer_override(self, obj: object) -> Any:
-        """Returns the reduction of objects that pickle does not store by itself."""
-        kept = _KEPT.get(type(obj))
-        if kept is not None:
-            return kept(obj, self._taken)
-        if isinstance(obj, Enum):  # Python 3.11.0 to 3.11.3 name members by getattr, which a state must not call
-            return type(obj), (obj.value,)
-        return NotImplemented
+        """Returns the reduction of objects that pickle does not copy as they are."""
+        reduced = _REDUCED.get(type(obj))
+        return NotImplemented if reduced is None else reduced(obj, self._taken)
 
 
-def _pickled(what: object, taken: Taken) -> bytes:
-    file = io.BytesIO()
-    _Writer(file, taken).dump(what)
-    return file.getvalue()
+class _Original(pickle.Unpickler):
+    """Unpickler of a copy made by this process, which looks the referenced objects up."""
+
+    def __init__(self, file: io.BytesIO, objects: list[object]) -> None:
+        super().__init__(file)
+        self._look_up = objects.__getitem__
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Returns the class or function of that name."""
+        if name == held.__name__ and module == __name__:
+            return self._look_up
+        return super().find_class(module, name)
 
 
-def _keep_state(state: State, taken: Taken) -> Any:
-    said = _fields_of(state)
-    said["journal"] = None
-    return blank, (State,), said, None, None, fill
+class _Held:
+    """An object to be referenced where pickle would copy it, as it copies a dict."""
+
+    def __init__(self, one: object) -> None:
+        self.one = one
 
 
-def _keep_map(map_: MapState, taken: Taken) -> Any:
-    said = _fields_of(map_)
-    said["keyframes"] = taken.hold(map_.keyframes.copy())
-    said["places"] = taken.hold({place: tuple(keys) for place, keys in map_.places.items()})
-    return blank, (MapState,), said, None, None, fill
+def _fields(one: object) -> dict[str, Any]:
+    return {name: getattr(one, name) for name in fields_of(type(one)) or ()}
 
 
-def _keep_matching(matching: MatchMemory, taken: Taken) -> Any:
-    said = _fields_of(matching)
-    if matching.bearing_rad is not None:
-        said["bearing_rad"] = taken.hold(matching.bearing_rad)
-    return blank, (MatchMemory,), said, None, None, fill
+def _changed(one: object, **changes: object) -> Any:
+    return blank, (type(one),), {**_fields(one), **changes}, None, None, fill
 
 
-def _keep_graph(graph: SubmapGraph, taken: Taken) -> Any:
-    said = _fields_of(graph)
-    said["submaps"] = taken.hold(graph.submaps.copy())
-    said["ties"] = taken.hold(graph.ties.copy())
-    return blank, (SubmapGraph,), said, None, None, fill
+def _state(state: State, taken: Taken) -> Any:
+    return _changed(state, journal=None)
 
 
-def _keep_aside(aside: SearchedAside, taken: Taken) -> Any:
-    said = _fields_of(aside)
-    said["submaps"], said["frames"] = taken.hold(aside.submaps), taken.hold(aside.frames)  # neither is ever changed
-    return blank, (SearchedAside,), said, None, None, fill
+def _map(map_: MapState, taken: Taken) -> Any:
+    places = {place: tuple(keys) for place, keys in map_.places.items()}
+    return _changed(map_, keyframes=_Held(map_.keyframes.copy()), places=_Held(places))
 
 
-def _keep_function(function: types.FunctionType, taken: Taken) -> Any:
-    if "<" not in function.__qualname__:
-        return NotImplemented
-    held = tuple(cell.cell_contents for cell in function.__closure__ or ())
-    names = function.__module__, function.__qualname__, function.__code__.co_firstlineno
-    return function_within, (*names, held, function.__defaults__)
+def _matching(matching: MatchMemory, taken: Taken) -> Any:
+    bearing = matching.bearing_rad
+    return _changed(matching, bearing_rad=None if bearing is None else _Held(bearing))
 
 
-def _keep_piece(piece: object, taken: Taken) -> Any:
-    return piece_of, (taken.hold(piece).number,)
+def _graph(graph: SubmapGraph, taken: Taken) -> Any:
+    return _changed(graph, submaps=_Held(graph.submaps.copy()), ties=_Held(graph.ties.copy()))
 
 
-_KEPT: Final[dict[type, Callable[[Any, Taken], Any]]] = {
-    **dict.fromkeys((Submap, Survey, ResidualMap, *FIXED), _keep_piece),
-    State: _keep_state,
-    MapState: _keep_map,
-    MatchMemory: _keep_matching,
-    SubmapGraph: _keep_graph,
-    SearchedAside: _keep_aside,
-    types.FunctionType: _keep_function,
-    WeakSet: lambda held, taken: (weak_set, (tuple(held),)),
-    _Ref: lambda ref, taken: (piece_of, (ref.number,)),
-    _Dict: lambda one, taken: (dict, (), None, None, iter(one.content.items())),
+def _aside(aside: SearchedAside, taken: Taken) -> Any:
+    return _changed(aside, submaps=_Held(aside.submaps), frames=_Held(aside.frames))  # neither is ever changed
+
+
+def _function(function: types.FunctionType, taken: Taken) -> Any:
+    return _reference(function, taken) if "<" in function.__qualname__ else NotImplemented
+
+
+def _reference(one: object, taken: Taken) -> Any:
+    return held, (taken.hold(one),)
+
+
+_REDUCED: Final[dict[type, Callable[[Any, Taken], Any]]] = {
+    **dict.fromkeys((Submap, Survey, ResidualMap, Keyframe, Settled, Patch), _reference),
+    State: _state,
+    MapState: _map,
+    MatchMemory: _matching,
+    SubmapGraph: _graph,
+    SearchedAside: _aside,
+    WeakSet: lambda elements, taken: (_Weak, (tuple(elements),)),
+    types.FunctionType: _function,
+    _Held: lambda one, taken: (held, (taken.hold(one.one),)),
 }
+
+
+# the description by the schema
+
+
+class _Describer:
+    """Makes the nodes of a graph of objects; each object becomes one node."""
+
+    def __init__(self, submaps: dict[int, tuple[Any, ...]]) -> None:
+        self._submaps = submaps
+        self._numbers: dict[int, int] = {}
+        self._kinds: dict[tuple[type, tuple[str, ...]], int] = {}
+        self._waiting: list[object] = []  # by number; an object is kept alive until all are described
+
+    def nodes(self, root: object) -> Iterator[Node]:
+        """Yields the nodes by number, the root first; raises `CannotTake`."""
+        self._value(root)
+        at = 0
+        while at < len(self._waiting):
+            try:
+                yield self._node(self._waiting[at])
+            except UnknownName as error:
+                raise CannotTake(str(error)) from error
+            at += 1
+
+    def _value(self, one: Any) -> Value:
+        kind = type(one)
+        if kind in _SCALARS:
+            return one  # type: ignore[no-any-return]  # of one of these types
+        if kind is int:
+            if not _LEAST <= one < _MOST:
+                raise CannotTake(f"the number {one} is too large for a state")
+            return one  # type: ignore[no-any-return]
+        number = self._numbers.get(id(one))
+        if number is None:
+            number = self._numbers[id(one)] = len(self._waiting)
+            self._waiting.append(one)
+        return Ref(number)
+
+    def _values(self, many: Iterable[object]) -> list[Value]:
+        return list(map(self._value, many))
+
+    def _node(self, one: Any) -> Node:
+        kind = type(one)
+        if kind is Kind:
+            return one  # type: ignore[no-any-return]
+        if kind is np.ndarray or isinstance(one, np.generic):
+            return _array(one)
+        if kind in CONTAINERS or kind is _Weak:
+            longest = one.maxlen if kind is deque else None
+            return Many("weakset" if kind is _Weak else CONTAINERS[kind], self._values(one), longest)
+        if kind is bytes:
+            return Blob(one)
+        if kind is dict:
+            return Table(self._values(one), self._values(one.values()))
+        if isinstance(one, Enum):
+            return Member(name_of(kind), one.value)
+        if kind is types.FunctionType:
+            return Call(name_of(one))
+        if kind is partial:
+            if one.keywords:
+                raise CannotTake(f"{one}: a job has arguments by position only")
+            return Call(name_of(one.func), self._values(one.args))
+        return self._record(one, kind)
+
+    def _record(self, one: Any, kind: type) -> Record:
+        if isinstance(one, (dict, list, set, frozenset, deque, str, bytes, int, float, type)) or (
+            isinstance(one, tuple) and not is_named_tuple(kind)
+        ):
+            raise CannotTake(f"{kind.__module__}.{kind.__qualname__} belongs into no state")
+        names = fields_of(kind)
+        if kind is Submap:
+            said = self._of_submap(one)
+        elif names is None:
+            said = attributes(one)
+            names = tuple(said)
+        else:
+            said = {name: getattr(one, name) for name in names}
+        assert names is not None
+        return Record(self._kind(kind, names), [self._value(said[name]) for name in names])
+
+    def _of_submap(self, submap: Submap) -> dict[str, Any]:
+        values = self._submaps.get(id(submap))
+        if values is None:
+            raise CannotTake(f"submap {submap.key} was not there when the state was taken")
+        return {**dict(zip(_SUBMAP, values, strict=True)), "hung": _Weak(values[-1])}
+
+    def _kind(self, kind: type, names: tuple[str, ...]) -> int:
+        number = self._kinds.get((kind, names))
+        if number is None:
+            if is_enumeration(kind):
+                raise UnknownName(f"{kind} has no records")
+            number = self._kinds[kind, names] = len(self._waiting)
+            self._waiting.append(Kind(name_of(kind), names))
+        return number
+
+
+def attributes(one: object) -> dict[str, Any]:
+    """Returns the attributes of an object whose class declares no fields; of an exception also its arguments."""
+    slots = (name for kind in type(one).__mro__ for name in getattr(kind, "__slots__", ()))
+    said = {name: getattr(one, name) for name in slots if hasattr(one, name)}
+    if isinstance(one, BaseException):
+        said["args"] = one.args
+    return {**said, **getattr(one, "__dict__", {})}
+
+
+def _array(one: Any) -> Array:
+    dtype = one.dtype
+    if dtype.kind not in PLAIN or dtype.names is not None:
+        raise CannotTake(f"arrays of {dtype} belong into no state")
+    order = "F" if one.flags.f_contiguous and not one.flags.c_contiguous else "C"
+    return Array(dtype.str, one.shape, order, one.tobytes(order), isinstance(one, np.generic))

@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from daemon.health.causes import cause_of
 from daemon.health.faults import FAULTS, Fault
 from daemon.recording.disk_writer import CLOCK, SEGMENT_BYTES, SegmentWriter, both
 from daemon.recording.replay_start import CYCLE_PARTS
@@ -240,7 +241,7 @@ class BlackBox:
         if faults == self._present:
             return
         new, self._present = faults - self._present - QUIET, faults
-        for fault in sorted(new):
+        for fault in sorted(fault for fault in new if not cause_of(fault, faults)):
             if self._pending is None and now - self._dumped.get(fault, -math.inf) >= AGAIN_S:
                 self._pending = now + AFTER_S, fault
                 self._dumped[fault] = now

@@ -13,7 +13,7 @@ from hal.replay.recording import STATE_SUFFIX, Recording
 from hal.replay.text import unreadable
 
 if TYPE_CHECKING:  # loads the estimator
-    from daemon.recording.restore import Piece
+    from daemon.recording.state_schema import Node
     from daemon.runtime.cycle import Cycle
     from estimator import Job, State
 
@@ -39,7 +39,7 @@ class Moment:
     cycle: int
     line: bytes
     versions: dict[str, str]
-    pieces: Iterator[Piece]
+    nodes: Iterator[Node]
 
     def load(self) -> Restored:
         """Returns the content; works once.
@@ -51,15 +51,27 @@ class Moment:
         from daemon.recording.state_file import BadState
 
         try:
-            state, rest = restore(self.pieces)
-            if unknown := set(rest["cycle"]) - set(CYCLE_PARTS):
-                raise CannotRestore(f"a cycle remembers no {', '.join(sorted(map(str, unknown)))}")
-        except (CannotRestore, BadState) as error:
+            state, rest = restore(self.nodes)
+            _check(rest)
+        except (CannotRestore, BadState, ValueError) as error:
             made = ", ".join(f"{name} {number}" for name, number in sorted(self.versions.items()))
             raise DataInvalid(
                 str(self.path), f"the state cannot be restored: {error}", f"replay it with {made}"
             ) from error
         return Restored(state, rest["jobs"], rest)
+
+
+def _check(rest: dict[str, Any]) -> None:
+    """Checks that the rest of a state has its parts.
+
+    Raises:
+        ValueError: one is missing, or there are others.
+    """
+    parts = [rest.get(name) for name in ("cycle", "jobs")] + [rest.get(name) or {} for name in ("samples", "blocks")]
+    if not all(type(part) is dict for part in parts) or not isinstance(rest["cycle"].get("cycles"), int):
+        raise ValueError("a cycle or its jobs are missing")
+    if unknown := set(rest["cycle"]) - set(CYCLE_PARTS):
+        raise ValueError(f"a cycle remembers no {', '.join(sorted(map(str, unknown)))}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,8 +118,8 @@ def read_moment(path: Path) -> Moment:
     from daemon.recording.state_file import BadState, read_state
 
     try:
-        header, line, pieces = read_state(path)
-        return Moment(path, float(header["t_state"]), int(header["cycle"]), line, dict(header["versions"]), pieces)
+        header, line, nodes = read_state(path)
+        return Moment(path, float(header["t_state"]), int(header["cycle"]), line, dict(header["versions"]), nodes)
     except OSError as error:
         raise unreadable(path, error) from error
     except BadState as error:

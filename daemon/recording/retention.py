@@ -63,7 +63,7 @@ LEAST_BYTES: Final = 256 << 20
 RESERVE_BYTES: Final = 512 << 20
 """Room that a recording leaves on its disk, bytes; maps are stored there, too."""
 BREATH_S: Final = 0.0005
-"""Pause between two slices of pickling, s."""
+"""Pause between two slices of nodes, s."""
 CLOSE_S: Final = 5.0
 
 
@@ -174,10 +174,10 @@ class Flight:
         from daemon.recording.checkpoint import CannotTake
         from daemon.recording.state_file import write_state
 
-        pieces, breathe = begun.taken.pieces(), partial(time.sleep, BREATH_S)
+        nodes, breathe = begun.taken.nodes(), partial(time.sleep, BREATH_S)
         try:
             self.state_bytes = write_state(
-                self._folder / state_name(begun.number), begun.header, begun.line, pieces, breathe
+                self._folder / state_name(begun.number), begun.header, begun.line, nodes, breathe
             )
         except (OSError, CannotTake) as error:
             self._fail("the state of the estimator", error)

@@ -2,9 +2,9 @@
 
 ``NNNNNN.lumistate``, little-endian: ``LUMISTAT``, format version (u16), length of the header (u32), the header (JSON),
 CRC-32 of all that (u32). Then follow blocks, each with the length of its content (u32), CRC-32 of that (u32), and the
-deflated content: a msgpack array of pieces ``[number, kind, content]``. `daemon.recording.checkpoint` defines the
-pieces; the root is the last one. The first piece has the number -2. It contains the bytes of the lidar line that the
-codec needs, as records.
+deflated content. The first block contains the bytes of the lidar line that the codec needs, as records. Each of the
+others contains a msgpack array of nodes as `daemon.recording.state_schema` defines them, by number. The last entry is
+an `End`. The inflated blocks have at most :data:`MOST_BYTES` in all.
 """
 
 from __future__ import annotations
@@ -20,20 +20,19 @@ from typing import Any, Final
 
 import msgspec
 
-from daemon.recording.restore import ROOT, Piece
+from daemon.recording.state_schema import VERSION, Array, Blob, End, Node
 from daemon.system.atomic_file import sync_folder
 
 MAGIC: Final = b"LUMISTAT"
-VERSION: Final = 2
-LINE: Final = -2
 BLOCK_BYTES: Final = 256 << 10
-LONGEST: Final = 1 << 30
+MOST_BYTES: Final = 1 << 29
+"""Limit of the inflated content, bytes; a ring of the flight recorder is not larger either."""
 _START: Final = struct.Struct("<8sHI")
 _BLOCK: Final = struct.Struct("<II")
 _CRC: Final = struct.Struct("<I")
 
 _encode: Final = msgspec.msgpack.Encoder().encode
-_decode: Final = msgspec.msgpack.Decoder(list[tuple[int, str, bytes]]).decode
+_decode: Final = msgspec.msgpack.Decoder(list[Node | End]).decode
 
 
 class BadState(Exception):
@@ -52,21 +51,21 @@ def write_state(
     path: Path,
     header: dict[str, Any],
     line: bytes,
-    pieces: Iterable[Piece],
+    nodes: Iterable[Node],
     breathe: Callable[[], object] = lambda: None,
 ) -> int:
     """Writes a checkpoint file, whole or not at all, and returns its size in bytes.
 
-    ``breathe`` is called after every :data:`SLICE` pieces.
+    ``breathe`` is called after every :data:`SLICE` nodes.
 
     Raises:
-        OSError: it cannot be written. CannotTake: a piece cannot be pickled.
+        OSError: it cannot be written. CannotTake: part of the state cannot be stored.
     """
     beside = path.with_name(f".{path.name}.part")
     try:
         with beside.open("wb") as file:
             file.write(_head(header))
-            for block in _blocks([Piece(LINE, "", line)], pieces, breathe):
+            for block in _blocks(line, nodes, breathe):
                 file.write(block)
             file.flush()
             os.fsync(file.fileno())
@@ -86,41 +85,46 @@ def _head(header: dict[str, Any]) -> bytes:
     return start + _CRC.pack(zlib.crc32(start))
 
 
-def _blocks(ready: list[Piece], pieces: Iterable[Piece], breathe: Callable[[], object]) -> Iterator[bytes]:
-    waiting, size = list(ready), 0
-    for piece in pieces:
-        waiting.append(piece)
-        size += len(piece.content)
-        if len(waiting) % SLICE == 0:
+def _blocks(line: bytes, nodes: Iterable[Node], breathe: Callable[[], object]) -> Iterator[bytes]:
+    yield _packed(line)
+    waiting: list[Node | End] = []
+    size = count = 0
+    for node in nodes:
+        waiting.append(node)
+        count += 1
+        size += len(node.data) if isinstance(node, Array | Blob) else NODE_BYTES
+        if count % SLICE == 0:
             breathe()
         if size >= BLOCK_BYTES:
-            yield _packed(waiting)
+            yield _packed(_encode(waiting))
             waiting, size = [], 0
-    yield _packed(waiting)
+    yield _packed(_encode([*waiting, End(count)]))
 
 
-SLICE: Final = 16
-"""Pieces pickled in one slice: some 0.2 ms."""
+SLICE: Final = 32
+"""Nodes made in one slice: some 0.2 ms."""
+NODE_BYTES: Final = 64
+"""Usual size of a node that is no array."""
 
 
-def _packed(pieces: list[Piece]) -> bytes:
-    content = zlib.compress(_encode(pieces), 1)
+def _packed(plain: bytes) -> bytes:
+    content = zlib.compress(plain, 1)
     return _BLOCK.pack(len(content), zlib.crc32(content)) + content
 
 
-def read_state(path: Path) -> tuple[dict[str, Any], bytes, Iterator[Piece]]:
-    """Returns the header, the bytes of the lidar line, and the pieces.
+def read_state(path: Path) -> tuple[dict[str, Any], bytes, Iterator[Node]]:
+    """Returns the header, the bytes of the lidar line, and the nodes.
 
     Raises:
         OSError: it cannot be read. BadState: it is damaged. OtherVersion: of another version.
     """
     data = path.read_bytes()
     header, at = _header(path, data)
-    pieces = _pieces(path, data, at)
-    first = next(pieces)
-    if first.number != LINE:
-        raise BadState(f"{path.name}: damaged")
-    return header, first.content, pieces
+    plain = _plain(path, data, at)
+    line = next(plain, None)
+    if line is None:
+        raise BadState(f"{path.name}: torn")
+    return header, line, _nodes(path, plain)
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -138,12 +142,16 @@ def _header(path: Path, data: bytes) -> tuple[dict[str, Any], int]:
         raise OtherVersion(f"{path.name}: format version {version}; this program reads version {VERSION}")
     if len(data) < end + _CRC.size or _CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
         raise BadState(f"{path.name}: damaged head")
-    header: dict[str, Any] = json.loads(data[_START.size : end])
+    try:
+        header: dict[str, Any] = msgspec.json.decode(data[_START.size : end], type=dict[str, Any])
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise BadState(f"{path.name}: damaged head: {error}") from error
     return header, end + _CRC.size
 
 
-def _pieces(path: Path, data: bytes, at: int) -> Iterator[Piece]:
-    piece = Piece(LINE, "", b"")
+def _plain(path: Path, data: bytes, at: int) -> Iterator[bytes]:
+    """Yields the inflated content of each block."""
+    left = MOST_BYTES
     while at < len(data):
         if len(data) < at + _BLOCK.size:
             raise BadState(f"{path.name}: torn")
@@ -152,17 +160,37 @@ def _pieces(path: Path, data: bytes, at: int) -> Iterator[Piece]:
         content = data[at : at + length]
         if len(content) < length or zlib.crc32(content) != crc:
             raise BadState(f"{path.name}: damaged")
-        for piece in map(Piece._make, _unpacked(path, content)):
-            yield piece
+        plain = _inflated(path, content, left)
+        left -= len(plain)
+        yield plain
         at += length
-    if piece.number != ROOT:
-        raise BadState(f"{path.name}: torn")
 
 
-def _unpacked(path: Path, content: bytes) -> list[tuple[int, str, bytes]]:
+def _inflated(path: Path, content: bytes, most: int) -> bytes:
+    """Returns the inflated content; stops where it has more than ``most`` bytes."""
     try:
-        inflater = zlib.decompressobj()
-        plain = inflater.decompress(content, LONGEST)
-        return _decode(plain)
-    except (zlib.error, msgspec.DecodeError) as error:
+        plain = zlib.decompressobj().decompress(content, most + 1)
+    except zlib.error as error:
         raise BadState(f"{path.name}: damaged: {error}") from error
+    if len(plain) > most:
+        raise BadState(f"{path.name}: more than {MOST_BYTES >> 20} MB when inflated")
+    return plain
+
+
+def _nodes(path: Path, plain: Iterator[bytes]) -> Iterator[Node]:
+    count, ended = 0, False
+    for content in plain:
+        try:
+            entries = _decode(content)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise BadState(f"{path.name}: damaged: {error}") from error
+        for entry in entries:
+            if ended or (isinstance(entry, End) and entry.nodes != count):
+                raise BadState(f"{path.name}: damaged")
+            if isinstance(entry, End):
+                ended = True
+            else:
+                count += 1
+                yield entry
+    if not ended:
+        raise BadState(f"{path.name}: torn")

@@ -17,21 +17,26 @@ from __future__ import annotations
 import gzip
 import math
 import zipfile
-import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from hal.errors import HalError
+from hal.replay.monotone_stamps import monotone
+from hal.replay.report import LogReport
+from hal.replay.text import Torn, lines
+
 Array = npt.NDArray[np.float64]
 
-GZIP_MAGIC: Final = b"\x1f\x8b"
 URG_STEP_RAD: Final = 2.0 * math.pi / 1024.0
 URG_FIRST_STEP, URG_FRONT_STEP = 44, 384
 URG_BEAMS, URG_FIELDS, URG_RANGES_AT = 682, 707, 24
+GIVE_UP_LINES: Final = 100
+"""Lines without a scan at the beginning after which a file is of another kind."""
 URG_PERIOD_S: Final = 0.1
 ROVER_COUNT_M: Final = 2.0 * math.pi * 0.077 / 2000.0
 ROVER_HALF_TRACK_M: Final = 0.165
@@ -67,12 +72,16 @@ class Laser:
 
 @dataclass(frozen=True)
 class Scans:
-    """Stamps (n,) in s, ranges (n, beams) in mm, robot poses (n, 3) by odometry in m, m, rad."""
+    """Stamps (n,) in s, ranges (n, beams) in mm, robot poses (n, 3) by odometry in m, m, rad.
+
+    ``report``: what of the input was skipped or repaired.
+    """
 
     laser: Laser
     stamps: Array
     ranges: npt.NDArray[np.int64]
     poses: Array
+    report: LogReport = field(default_factory=LogReport)
 
 
 def read(path: Path) -> Scans:
@@ -93,7 +102,8 @@ def read(path: Path) -> Scans:
 
 def read_dat(path: Path) -> Scans:
     """Returns a ``.dat`` file as logged: every range, stamps of the host, odometry poses at those stamps."""
-    rows = np.array(list(_fields(path)))
+    report = LogReport()
+    rows = _rows(path, report)
     laser = Laser(
         model="URG-04LX",
         start=(URG_FIRST_STEP - URG_FRONT_STEP) * URG_STEP_RAD,
@@ -105,23 +115,57 @@ def read_dat(path: Path) -> Scans:
         mount=ROVER_MOUNT,
     )
     ranges = rows[:, URG_RANGES_AT : URG_RANGES_AT + URG_BEAMS].astype(np.int64)
-    return Scans(laser, 1e-6 * rows[:, 0], ranges, wheel_poses(rows[:, 2:4]))
+    return Scans(laser, _timed(path, 1e-6 * rows[:, 0], report), ranges, wheel_poses(rows[:, 2:4]), report)
 
 
-def _fields(path: Path) -> Iterator[list[float]]:
+def _rows(path: Path, report: LogReport) -> Array:
+    """Returns the fields of every scan, (n, 707); lines that are no scan are counted in ``report``.
+
+    Raises:
+        NotConverted: it cannot be read, or holds no scan.
+    """
+    torn, rows = Torn(), []
     try:
-        data = path.read_bytes()
-        text = gzip.decompress(data) if data.startswith(GZIP_MAGIC) else data
-    except (EOFError, zlib.error, OSError) as error:
-        raise NotConverted(f"{path}: {error}") from error
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
-        if len(words) != URG_FIELDS:
-            raise NotConverted(f"{path}:{number}: {len(words)} fields; a scan of this format has {URG_FIELDS}")
-        try:
-            yield list(map(float, words))
-        except ValueError as error:
-            raise NotConverted(f"{path}:{number}: {error}") from error
+        for number, line in lines(path, torn):
+            try:
+                rows.append(_fields(line))
+            except ValueError as error:
+                report.skip(number, str(error))
+                if not rows and number >= GIVE_UP_LINES:
+                    break
+    except HalError as error:
+        raise NotConverted(str(error)) from error
+    if torn.reason:
+        report.notes.append(f"{torn.reason}; what was read is used")
+    if not rows:
+        first = next(((entry.first[0], reason) for reason, entry in report.skipped.items()), None)
+        raise NotConverted(f"{path}: {torn.reason}" if first is None else f"{path}:{first[0]}: {first[1]}")
+    return np.array(rows)
+
+
+def _fields(line: bytes) -> list[float]:
+    words = line.split()
+    if len(words) != URG_FIELDS:
+        raise ValueError(f"{len(words)} fields; a scan of this format has {URG_FIELDS}")
+    values = list(map(float, words))
+    if not all(map(math.isfinite, values)):
+        raise ValueError("a field is not a number")
+    return values
+
+
+def _timed(path: Path, stamps: Array, report: LogReport) -> Array:
+    """Returns stamps that increase, s: as they are if they do, repaired where the clock was set or is coarse.
+
+    Raises:
+        NotConverted: they contain no usable time.
+    """
+    clock = monotone(stamps, float(stamps[0]))
+    if clock.refusal:
+        raise NotConverted(f"{path}: its stamps give no time: {clock.refusal}")
+    if np.all(np.diff(stamps) > 0.0) and not clock.restarts:
+        return stamps
+    report.notes.append("stamps run back or repeat: the clock's changes are bridged, equal stamps spread")
+    return np.asarray(stamps[0] + clock.time)
 
 
 def wheel_poses(counts: Array) -> Array:
@@ -145,7 +189,10 @@ def read_npz(path: Path) -> Scans:
     if ranges.ndim != 2 or stamps.shape != ranges.shape[:1]:
         raise NotConverted(f"{path}: {stamps.shape} stamps for ranges of shape {ranges.shape}")
     laser = Laser("UTM-30LX", float(start), float(step), 23, 60_000, UTM_STEPS * float(beam_dt), float(beam_dt))
-    return Scans(laser, stamps.astype(np.float64), ranges.astype(np.int64), np.zeros((len(stamps), 3)))
+    report, times = LogReport(), stamps.astype(np.float64)
+    if not len(times) or not np.all(np.isfinite(times)):
+        raise NotConverted(f"{path}: {len(times)} stamps, of which {np.count_nonzero(np.isfinite(times))} are numbers")
+    return Scans(laser, _timed(path, times, report), ranges.astype(np.int64), np.zeros((len(times), 3)), report)
 
 
 def even_stamps(scans: Scans, delay: float) -> Scans:
@@ -154,6 +201,8 @@ def even_stamps(scans: Scans, delay: float) -> Scans:
     The motor turns evenly, but the host receives unevenly. An arrival identifies its revolution; all arrivals together
     determine the instants of the revolutions. ``delay``: from the first beam of a scan to its mean arrival, s.
     """
+    if len(scans.stamps) < 2:  # no period follows from one scan
+        return scans
     period, first = _rhythm(scans.stamps)
     turns = _turns((scans.stamps - first) / period)
     late = scans.stamps - first - turns * period

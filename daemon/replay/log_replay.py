@@ -5,14 +5,13 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.config.schema import Config
 from daemon.recording.recorder import MAP
 from daemon.replay.recorded_inputs import NOTHING_GIVEN, Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
-from daemon.replay.sources import Source, open_log
+from daemon.replay.sources import Source
 from daemon.runtime import warmup
 from daemon.system import console
 from estimator.paper import LUMILOOP
@@ -37,7 +36,7 @@ class Outcome:
 
 
 def replay(
-    path: Path,
+    source: Source,
     config: Config,
     given: Given = NOTHING_GIVEN,
     journal: MatchJournal | None = None,
@@ -46,18 +45,16 @@ def replay(
     """Replays a log through the pipeline, or through another method.
 
     Args:
-        path: the log.
+        source: the log, opened and not replayed yet.
         config: resolved configuration.
         given: the part of it that the operator has set; the log supplies the rest where it contains it.
         journal: matches to keep for inspection.
         method: name of the method, see `estimator.paper.METHODS`.
 
     Raises:
-        HalError: the log cannot be opened. Later errors end the run and are in `Outcome.stopped`.
+        HalError: the log cannot be used. Later errors end the run and are in `Outcome.stopped`.
     """
     begun = time.perf_counter()
-    console.progress(f"replay: reading {path}")
-    source = open_log(path)
     used = config_for(source, config, given)
     lights = lights_for(source, used, given)
     if lights is not None:
@@ -68,7 +65,7 @@ def replay(
         start = None
         _load_method(source, given, method)
     outcome = Outcome(source, used, Rerun(source, used, lights, journal, start, method), journal)
-    outcome.seconds["read"] = time.perf_counter() - begun
+    outcome.seconds["read"] = source.read_s + time.perf_counter() - begun
     begun = time.perf_counter()
     try:
         _play(outcome.rerun, source)

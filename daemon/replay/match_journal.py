@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.replay import match_plot
-from daemon.replay.results import OutputRefused
+from daemon.replay.results import OutputRefused, written_rows, written_stamp
 from daemon.system.extras import how_to_install
 from estimator import (
     Array,
@@ -168,14 +168,15 @@ class MatchJournal:
     def named(self, stamps: Array) -> list[Named]:
         """Returns the kept matches by number, with their identification in ``trajectory.tum``.
 
-        ``stamps``: of the poses in order of arrival, s; the file has them in ascending order.
+        ``stamps``: of the poses in order of arrival, s; the file has :func:`written_rows` of them.
         """
-        line = np.empty(len(stamps), np.int64)
-        line[np.argsort(stamps, kind="stable")] = 1 + np.arange(len(stamps))
+        rows = written_rows(stamps)
+        line = {written_stamp(float(stamps[row])): 1 + at for at, row in enumerate(rows)}
         found = []
         for number, (seconds, _) in sorted(self.kept.items()):
             row = self.rows.get(number)
-            known = (None, None) if row is None else (int(line[row]), round(float(stamps[row]), 6))
+            stamp = None if row is None else written_stamp(float(stamps[row]))
+            known = (None, None) if stamp is None else (line[stamp], stamp)
             found.append(Named(number, seconds, *known))
         return found
 

@@ -89,6 +89,7 @@ def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
         "counts": {
             "scans": source.status.scans,
             "poses": len(ledger),
+            "guesses": sum(map(bool, ledger.online().guesses())),
             "cycles": ledger.cycles,
             "dropped": ledger.dropped,
             "odometry": rerun.readings,

@@ -19,6 +19,8 @@ from daemon.snapshot import GUESSED, State
 from estimator import Array
 
 _PROBE: Final = ".lumiloop-probe"
+DOUBTFUL: Final = 0.1
+"""Share of unconfirmed poses above which a result is doubtful as a whole."""
 _TUM_HEAD: Final = "# timestamp x y z qx qy qz qw\n"
 
 
@@ -35,15 +37,31 @@ class Trajectory:
     states: npt.NDArray[np.int64] | None = None
 
     def ordered(self) -> Trajectory:
-        """Returns the trajectory in ascending order of stamps, equal stamps in their given order."""
-        order = np.argsort(self.stamps, kind="stable")
-        return Trajectory(self.stamps[order], self.poses[order], None if self.states is None else self.states[order])
+        """Returns the poses in ascending order of stamps, one per stamp: see :func:`written_rows`."""
+        rows = written_rows(self.stamps)
+        return Trajectory(self.stamps[rows], self.poses[rows], None if self.states is None else self.states[rows])
 
     def guesses(self) -> list[str]:
         """Returns for every pose the state in which it is unconfirmed; empty for a confirmed one."""
         if self.states is None:
             return [""] * len(self.stamps)
         return [State(state).name if state in GUESSED else "" for state in self.states.tolist()]
+
+
+def written_stamp(stamp: float) -> float:
+    """Returns a stamp, s, as a file has it: to the microsecond."""
+    return round(stamp, 6)
+
+
+def written_rows(stamps: Array) -> npt.NDArray[np.int64]:
+    """Returns the rows that a trajectory file has, in its order: ascending by stamp, one per :func:`written_stamp`.
+
+    Of several poses of one instant the last one stays: it includes a correction that arrived later.
+    """
+    written = np.array([written_stamp(stamp) for stamp in stamps.tolist()])
+    order = np.argsort(written, kind="stable")
+    later = np.diff(written[order], append=np.inf) > 0.0
+    return order[later]
 
 
 class Folder:
@@ -124,9 +142,9 @@ class Folder:
 
 
 def tum(trajectory: Trajectory) -> bytes:
-    """Returns TUM text: ``t x y z qx qy qz qw``, one pose a line, ascending by stamp.
+    """Returns TUM text: ``t x y z qx qy qz qw``, one pose a line, one per stamp, ascending by stamp.
 
-    Equal stamps stay in their given order. An unconfirmed pose is a comment, ``# STATE t x y ...``, so that an
+    An unconfirmed pose is a comment, ``# STATE t x y ...``, so that an
     evaluation uses confirmed poses only.
     """
     told = trajectory.ordered()
@@ -151,10 +169,19 @@ def guessed(told: Trajectory) -> str:
     return f"{states.total()} of {len(guesses)} poses are guesses, their place was not known ({named}){last}"
 
 
-def kitti(trajectory: Trajectory) -> bytes:
-    """Returns KITTI text: the upper three rows of each pose's matrix in one line, ascending by stamp, without stamps.
+def doubt(told: Trajectory) -> str:
+    """Returns a warning if more than :data:`DOUBTFUL` of the poses are unconfirmed; empty otherwise."""
+    share = sum(map(bool, told.guesses())) / max(1, len(told.stamps))
+    if share <= DOUBTFUL:
+        return ""
+    return f"{100.0 * share:.0f} % of the poses are guesses: do not rely on this trajectory, nor on its map"
 
-    The format has no comments either, so unconfirmed poses are omitted.
+
+def kitti(trajectory: Trajectory) -> bytes:
+    """Returns KITTI text: the upper three rows of each pose's matrix in one line, without stamps.
+
+    The poses are those of the TUM text, in the same order. The format has no comments, so unconfirmed poses are
+    omitted.
     """
     told = trajectory.ordered()
     poses = told.poses[[not guess for guess in told.guesses()]]

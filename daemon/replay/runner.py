@@ -19,6 +19,7 @@ from daemon.devices.conversion import SampleBridge, ScanBridge
 from daemon.devices.light_setup import Lights
 from daemon.devices.photodiode import BlockWatch
 from daemon.health.assessment import REPLAYED, assess
+from daemon.health.causes import grouped
 from daemon.health.faults import Fault
 from daemon.maps.container import BadMap
 from daemon.maps.grid_files import finest
@@ -32,7 +33,7 @@ from daemon.replay.trajectories import Ledger
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.cycle import Cycle
 from daemon.runtime.cycle_parts import CycleRecord, Parts, Step
-from daemon.runtime.vitals import vitals
+from daemon.runtime.vitals import ProcessFacts, vitals
 from daemon.runtime.worker import CycleWorker, ScheduledWorker
 from estimator import UNLIMITED, Array, Grid, Identity, Limits, MapImage, Order, Record, StepResult, image_of
 from estimator.paper import LUMILOOP, method
@@ -198,14 +199,14 @@ class Rerun:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """Present faults, gravest first; to be read once a second.
+        """Present faults, gravest cause first; to be read once a second.
 
         Faults that follow from the data (:data:`~daemon.health.assessment.REPLAYED`) are derived again. All others are
         those that were published.
         """
-        now = vitals(self.cycle.facts(), set(), 0.0)
+        now = vitals(self.cycle.facts(), set(), ProcessFacts())
         again = [fault for fault in assess(now, now) if fault in REPLAYED]
-        return tuple(sorted([*again, *(fault for fault in Fault if fault in self._published - REPLAYED)]))
+        return grouped([*again, *(fault for fault in Fault if fault in self._published - REPLAYED)])
 
     def feed(self, event: Event) -> None:
         """Consumes one event and runs a cycle if one is due."""
@@ -344,7 +345,6 @@ class Rerun:
         self._kept.append(record)
         if self.watch is not None:
             self.watch(record)
-        rows = len(self.ledger)
-        self.ledger.add(record, *self._latest)
+        row = self.ledger.add(record, *self._latest)
         if self._journal is not None:
-            self._journal.gave(rows if len(self.ledger) > rows else None)
+            self._journal.gave(row)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -70,6 +71,7 @@ class Source(ABC):
         header: of a recording: its versions and configuration.
         begin: checkpoint that it begins with; None at the start of a run.
         t_begun: start of the run in its own time, s; 0: not known.
+        read_s: duration of opening it, s.
     """
 
     kind: ClassVar[str]
@@ -85,6 +87,7 @@ class Source(ABC):
         self.header: dict[str, Any] = {}
         self.begin: Moment | None = None
         self.t_begun = 0.0
+        self.read_s = 0.0
 
     @abstractmethod
     def events(self) -> Iterator[Event]:
@@ -103,8 +106,15 @@ def open_log(path: Path) -> Source:
     """Detects the kind of a log and reads as much of it as its replay needs.
 
     Raises:
-        HalError: missing, unreadable, or of no known kind; names the file and the remedy.
+        HalError: missing, unreadable, of no known kind, or without usable time; names the file and the remedy.
     """
+    begun = time.perf_counter()
+    source = _open(path)
+    source.read_s = time.perf_counter() - begun
+    return source
+
+
+def _open(path: Path) -> Source:
     if path.is_dir():
         return RecordingSource(path)
     begin = head(path)
@@ -119,9 +129,10 @@ def open_log(path: Path) -> Source:
     return CarmenSource(path)
 
 
+MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 FOREIGN: Final = {
     b"#ROSBAG": "a ROS 1 bag",
-    b"\x89MCAP0\r\n": "an MCAP file",
+    MCAP_MAGIC: "an MCAP file",
     b"SQLite format 3": "a ROS 2 bag",
     b"PK\x03\x04": "a zip or npz archive",
     b"\x93NUMPY": "a numpy array",

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from daemon.replay.results import Trajectory
+from daemon.replay.results import Trajectory, written_stamp
 from daemon.runtime.cycle_parts import CycleRecord
 from estimator import Array, Loop, StepResult, se2
 
@@ -21,10 +21,10 @@ _ONLINE, _ODOM, _ON_ANCHOR = slice(2, 5), slice(5, 8), slice(8, 11)
 
 @dataclass(slots=True)
 class Ledger:
-    """Table with one row per scan, in the order of the log, and counters.
+    """Table with one row per pose, in the order of the log, and counters.
 
-    A row has 96 bytes: a day at 40 Hz fits into memory. Where scans are missing, there is a row for each cycle in which
-    light alone held the pose.
+    A scan gives a row, and where scans are missing, each cycle in which light alone held the pose. A cycle that
+    corrects the pose of the same instant replaces the row. A row has 96 bytes: a day at 40 Hz fits into memory.
 
     Attributes:
         cycles, keyframes, matched: counts. outcomes: number of matches by reason. states: number of snapshots by state.
@@ -50,23 +50,39 @@ class Ledger:
         """Number of rows: cycles that gave a pose."""
         return len(self._rows) // _FIELDS
 
-    def add(self, record: CycleRecord, stamp: float, t_mono: float) -> None:
-        """Adds one cycle; ``stamp``: the log's for the latest scan or block, s, whose time is ``t_mono``, s."""
+    def add(self, record: CycleRecord, stamp: float, t_mono: float) -> int | None:
+        """Adds one cycle; returns the row of its pose, None without one.
+
+        ``stamp``: the log's for the latest scan or block, s, whose time is ``t_mono``, s.
+        """
         self.cycles += 1
         self.dropped += len(record.dropped)
         self.states[record.snapshot.state.name] += 1
         result, pose = record.result, record.snapshot.pose
         if result is None:
-            return
+            return None
         self.jumps = result.jumps
         if record.limits is not None:
             self._count(result, stamp)
         lit = record.samples > self._samples and result.lights is not None and result.placed
         self._samples = record.samples
-        if (record.scan is not None or lit) and pose is not None:
-            at = stamp + (result.t_mono - t_mono)
-            odom, on_anchor = result.T_odom_base.tolist(), result.T_anchor_base.tolist()
-            self._rows.extend((at, result.anchor, *pose, *odom, *on_anchor, record.snapshot.state))
+        if pose is None or not (record.scan is not None or lit):
+            return None
+        at = stamp + (result.t_mono - t_mono)
+        odom, on_anchor = result.T_odom_base.tolist(), result.T_anchor_base.tolist()
+        return self._put((at, result.anchor, *pose, *odom, *on_anchor, float(record.snapshot.state)))
+
+    def _put(self, row: tuple[float, ...]) -> int:
+        """Appends a row, or replaces the last one if that has the same stamp; returns its number."""
+        if len(self) > self._fixed and written_stamp(self._rows[-_FIELDS]) == written_stamp(row[_STAMP]):
+            del self._rows[-_FIELDS:]
+        self._rows.extend(row)
+        return len(self) - 1
+
+    @property
+    def _fixed(self) -> int:
+        """Number of rows whose poses :meth:`settle` has fixed."""
+        return sum(map(len, self._settled))
 
     def _count(self, result: StepResult, stamp: float) -> None:
         self.keyframes += result.keyframe >= 0
@@ -85,7 +101,7 @@ class Ledger:
         Called before the map is discarded and at the end of the log. A pose whose anchor is not among ``keyframes``
         stays as published.
         """
-        rows = self._table()[sum(map(len, self._settled)) :]
+        rows = self._table()[self._fixed :]
         final = rows[:, _ONLINE].copy()
         for i, row in enumerate(rows):
             place = keyframes.get(int(row[_ANCHOR]))

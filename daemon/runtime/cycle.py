@@ -14,9 +14,8 @@ from dataclasses import replace
 from typing import Final
 
 from daemon.devices.conversion import ImuBridge, OdometryBridge
-from daemon.health.journal_fields import of_state
-from daemon.health.reasons import REASONS
 from daemon.health.reasons import Reason as Cause
+from daemon.health.state_log import StateLog
 from daemon.integrity.evidence import SILENT_PERIODS, Evidence
 from daemon.integrity.input_monitor import Watch
 from daemon.integrity.lamp_monitor import LampWatch
@@ -80,6 +79,7 @@ class Cycle:
         self._switched = ""
         self._held: list[Answer] = []
         self._left_out = LeftOut()
+        self._state_log = StateLog(self.verdict.state, self.verdict.reason)
         self.stage_timer = parts.timer
         self.timing = TimingStatistics()
 
@@ -247,16 +247,13 @@ class Cycle:
             self.lamps.on_step(t_mono, self.result.lights, fresh)
 
     def _judge(self, t_mono: float, records: tuple[Record, ...], fresh: StepResult | None) -> Memory:
-        """Updates state and reason, and logs a change."""
+        """Updates state and reason, and logs changes."""
         evidence = self.observer.evidence(t_mono, self.period.seconds, self.parts.status, records, fresh)
-        before, self.verdict = self.verdict, judge(self.verdict, evidence)
+        self.verdict = judge(self.verdict, evidence)
         compared = bool(self.lidar_ok(t_mono)) and self.observer.unused is None
         self.watch.on_verdict(t_mono, self.verdict, compared)
         self.trust = self._trust(t_mono, evidence)
-        if (before.state, before.reason) != (self.verdict.state, self.verdict.reason):
-            meaning, remedy = REASONS[self.verdict.reason]
-            told, said = self.verdict.state.name, f" ({remedy})" if remedy else ""
-            log.info("%s: %s%s", told, meaning, said, extra=of_state(told, meaning, remedy))
+        self._state_log.on_cycle(t_mono, self.verdict.state, self.verdict.reason)
         return self.verdict
 
     def _trust(self, t_mono: float, evidence: Evidence) -> Trust:

@@ -19,6 +19,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from daemon.system.processor_wait import ProcessorWait
+
 log = logging.getLogger(__name__)
 
 AGAIN_S: Final = 10.0
@@ -64,8 +66,8 @@ class StallWatch:
         self._caught: Caught | None = None
         self._armed = self._due = time.monotonic()
         self._cpu = time.thread_time()
-        self._schedstat = _open(f"/proc/self/task/{threading.get_native_id()}/schedstat")
-        self._kept = self._stolen()
+        self._wait = ProcessorWait()
+        self._kept = self._wait.seconds()
         self._said_at = -AGAIN_S
         self._unsaid = 0
         self._before = signal.signal(signal.SIGALRM, self._ring)
@@ -83,7 +85,7 @@ class StallWatch:
             lasted = now - self._armed
             self._tell(caught, lasted, cpu - self._cpu)
         self._armed, self._due, self._cpu = now, now + seconds, cpu
-        self._kept = self._stolen()
+        self._kept = self._wait.seconds()
         return lasted
 
     def close(self) -> None:
@@ -91,9 +93,7 @@ class StallWatch:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         if signal.getsignal(signal.SIGALRM) == self._ring:
             signal.signal(signal.SIGALRM, self._before)
-        if self._schedstat >= 0:
-            os.close(self._schedstat)
-        self._schedstat = -1
+        self._wait.close()
 
     def _ring(self, number: int, frame: FrameType | None) -> None:
         """Captures the state when the timer expires; never blocks."""
@@ -116,18 +116,11 @@ class StallWatch:
             self._unsaid += 1
             return
         more = f"; {self._unsaid} more since the line before" if self._unsaid else ""
-        stolen = self._stolen()
+        stolen = self._wait.seconds()
         waited = None if stolen is None or self._kept is None else stolen - self._kept
         self.said = f"no cycle began for {lasted:.3f} s: {cause(caught, lasted, worked, waited)}{more}"
         log.info("%s", self.said)  # a long stall is a fault with its own warning
         self._said_at, self._unsaid = now, 0
-
-    def _stolen(self) -> float | None:
-        """Seconds for which this thread was ready while another program ran; None if the kernel has no such figure."""
-        try:
-            return int(os.pread(self._schedstat, 100, 0).split()[1]) * 1e-9
-        except (OSError, IndexError, ValueError):
-            return None
 
 
 def cause(caught: Caught, lasted: float, worked: float, waited: float | None) -> str:
@@ -162,13 +155,6 @@ def place(frame: FrameType | None) -> str:
 def _resting(name: str) -> bool:
     """True if our innermost function is only the one that runs the loop."""
     return name.endswith((".main", ".run", ".<module>"))
-
-
-def _open(path: str) -> int:
-    try:
-        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return -1
 
 
 def _task() -> str:

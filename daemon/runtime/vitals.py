@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,22 @@ from daemon.runtime.cycle_facts import CycleFacts
 from daemon.snapshot import CycleTiming
 
 
-def vitals(facts: CycleFacts, failed: set[str], lateness: float) -> Vitals:
-    """Returns the present vitals; ``failed``: names of failed components, ``lateness``: of the loop, s."""
+@dataclass(frozen=True, slots=True)
+class ProcessFacts:
+    """Facts on the process.
+
+    Attributes:
+        lateness: delay of the loop, s. waited: time for which the loop was ready while other programs ran, s, since the
+            start. no_descriptors: hardly any file descriptor is left.
+    """
+
+    lateness: float = 0.0
+    waited: float = 0.0
+    no_descriptors: bool = False
+
+
+def vitals(facts: CycleFacts, failed: set[str], process: ProcessFacts) -> Vitals:
+    """Returns the present vitals; ``failed``: names of failed components."""
     lidar = facts.lidar
     return Vitals(
         t_mono=facts.t_mono,
@@ -41,7 +56,9 @@ def vitals(facts: CycleFacts, failed: set[str], lateness: float) -> Vitals:
         overruns=facts.overruns,
         short=facts.short,
         jobs_failed=facts.jobs_failed,
-        lateness=lateness,
+        lateness=process.lateness,
+        waited=process.waited,
+        no_descriptors=process.no_descriptors,
         alert=facts.alert,
         failed=frozenset(failed) | (frozenset(["publisher"]) if facts.sink_failing else frozenset()),
     )

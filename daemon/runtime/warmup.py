@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import gc
 import hashlib
 import logging
@@ -23,6 +24,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from daemon.runtime.cache_complaint import CacheComplaint
+from daemon.system.atomic_file import sync_folder, write_whole
 from daemon.system.kernel_lock import KernelLock, before_compiling, waits
 from hal.blocking_calls import run_in_thread
 
@@ -47,6 +50,7 @@ MAKE: Final = frozenset({
 """Keys in /proc/cpuinfo of the processor's type, for x86 and for ARM."""
 REPORT_S: Final = 5.0
 """Seconds between two progress lines."""
+EACH: Final = "they cannot be stored, so that each start compiles them"
 _one: Final = threading.Lock()
 """Serialises loading within one process."""
 LOOK_S: Final = 0.5
@@ -63,12 +67,15 @@ class Warmth:
 
     Attributes:
         compiled: kernels had to be compiled. seconds: duration, s. code_us: cost of the search for one light code on
-            this computer, us; 0 without lights.
+            this computer, us; 0 without lights. damaged: number of cache files that existed and could not be used.
+            unwritten: reason why compiled kernels could not be stored, empty: none failed.
     """
 
     compiled: bool
     seconds: float
     code_us: float = 0.0
+    damaged: int = 0
+    unwritten: str = ""
 
 
 async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | None = None) -> Warmth:
@@ -87,7 +94,8 @@ async def warm_up(progress: Callable[[str], None] = log.info, lights: Lights | N
     gc.collect()
     gc.freeze()  # present objects stay: the collector need not scan them during a cycle
     if warmth.compiled:
-        progress(f"kernels compiled in {warmth.seconds:.0f} s; later starts load them in less than a second")
+        later = EACH if warmth.unwritten else "later starts load them in less than a second"
+        progress(f"kernels compiled in {warmth.seconds:.0f} s; {later}")
     return warmth
 
 
@@ -97,19 +105,32 @@ def load(lights: Lights | None = None) -> Warmth:
     If kernels are missing, it waits until no other process compiles any; otherwise it waits for no process.
 
     Raises:
-        CannotLoad: there is no folder for compiled kernels, or memory must not be made executable here.
+        CannotLoad: there is no folder for compiled kernels, memory must not be made executable here, or there is not
+            enough of it.
     """
     begun = time.monotonic()
     try:
         with _one:
             return _load(begun, lights)
+    except (MemoryError, ImportError) as error:
+        raise CannotLoad(_cause_of(error)) from error
     except PermissionError as error:
         remedy = "the process must be allowed to make memory executable"  # see MemoryDenyWriteExecute= (systemd.exec)
         if error.filename is not None:
             remedy = "give that file to the user who runs this, or name another folder with NUMBA_CACHE_DIR"
         raise CannotLoad(f"kernels cannot be compiled: {error}; {remedy}") from error
     except (OSError, RuntimeError) as error:
-        raise CannotLoad(f"kernels cannot be loaded: {error}") from error
+        raise CannotLoad(_cause_of(error)) from error
+
+
+def _cause_of(error: BaseException) -> str:
+    """Readable cause of a failure to load; a memory limit appears as a library that cannot be mapped."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, MemoryError) or os.strerror(errno.ENOMEM) in str(cause):
+            return f"not enough memory to load the kernels ({error}); raise MemoryMax=, or the limit of `ulimit -v`"
+        cause = cause.__cause__ or cause.__context__
+    return f"kernels cannot be loaded: {error}"
 
 
 def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object], module: str = "") -> None:
@@ -129,7 +150,7 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
             work()
             if module:
                 _import(module)
-        mark_of(what).touch()
+        _mark(what)
     except (OSError, RuntimeError) as error:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
     if count := len(_compiled() - before):
@@ -182,13 +203,22 @@ def mark_of(what: str) -> Path:
 
 def _processor() -> str:
     """Returns type and features of the first processor as Linux lists them (proc(5)): more than the compiler uses."""
-    first = CPUINFO.read_text().partition("\n\n")[0]
+    try:
+        first = CPUINFO.read_text().partition("\n\n")[0]
+    except OSError:  # an unknown processor; numba's own key still tells processors apart
+        return ""
     return "\n".join(line for line in first.splitlines() if line.partition("\t")[0].partition(":")[0].strip() in MAKE)
 
 
 def is_marked(what: str) -> bool:
-    """True if the mark file and kernels exist; a clean-up of the disk may delete the kernels, which are large."""
-    return mark_of(what).exists() and bool(_compiled())
+    """True if the mark file and kernels exist; a clean-up of the disk may delete the kernels, which are large.
+
+    A mark shows that a start has compiled everything, and not that each file is still good: only loading does.
+    """
+    try:
+        return mark_of(what).exists() and bool(_compiled())
+    except OSError:  # what cannot be read is compiled
+        return False
 
 
 def _what(lights: bool) -> str:
@@ -224,10 +254,12 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
                 "first start of this version: compiling its %d kernels, or what is missing of them (a minute or two)",
                 count,
             )
+        complaint = CacheComplaint()
 
         def missing() -> None:
             """Takes the lock when a kernel is missing despite the mark."""
             nonlocal compiled
+            complaint.log()
             lock.acquire()
             compiled = True
 
@@ -235,8 +267,26 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
             _exercise()
             code_us = 0.0 if lights is None else _exercise_lights(lights)
         if cold:
-            mark_of(what).touch()
-    return Warmth(compiled, time.monotonic() - begun, code_us)
+            _mark(what)
+    damaged, unwritten = complaint.result()
+    return Warmth(compiled, time.monotonic() - begun, code_us, damaged, unwritten)
+
+
+def _mark(what: str) -> None:
+    """Writes the mark file, after the names of all compiled kernels have been synced to the disk.
+
+    A mark that cannot be written costs the next start a search for missing kernels, and nothing else.
+    """
+    from estimator import CACHE_DIR, CACHE_REPORT
+
+    if CACHE_REPORT.unwritten:
+        return
+    try:
+        for folder in (CACHE_DIR, *{path.parent for path in _compiled()}):
+            sync_folder(folder)
+        write_whole(mark_of(what), b"")
+    except OSError as error:
+        log.warning("%s cannot be written: %s", mark_of(what), error.strerror)
 
 
 @contextlib.contextmanager
@@ -314,7 +364,10 @@ def _progress_line(seconds: float, lights: bool = False) -> str:
     if waits.is_set():
         return f"waiting for another process, which compiles kernels, after {seconds:.0f} s"
     since = time.time() - seconds
-    count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))
+    try:
+        count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))
+    except OSError:  # another process has just removed it, or the disk fails
+        return ""
     if count == 0:
         return f"still loading the estimator after {seconds:.0f} s"
     total = kernel_count(lights)  # kernels of other parts of the program may have been compiled too

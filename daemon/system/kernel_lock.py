@@ -1,8 +1,8 @@
 """File lock for the cache of compiled kernels: a compiling process holds it; a process that only loads needs none.
 
-numba writes each cache file under a temporary name and renames it. A reader therefore finds a complete file or none,
+Each cache file is written under a temporary name and renamed. A reader therefore finds a complete file or none,
 and compiles a kernel that is missing. A process that finds all kernels never waits.
-Two processes that compile at once would do the same work twice and could damage the cache's index.
+Two processes that compile at once would do the same work twice, which is the lesser evil where no lock can be taken.
 """
 
 from __future__ import annotations
@@ -10,12 +10,19 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import logging
+import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Final, Self
+from typing import Final, Self
 
 log = logging.getLogger(__name__)
+
+MOST_S: Final = 600.0
+"""Longest wait in s for another process, which may be stopped or stand at a disk."""
+LOOK_S: Final = 0.2
+"""Interval in s between two attempts to take the lock."""
 
 waits: Final = threading.Event()
 """Set while this process waits for another one that compiles."""
@@ -30,34 +37,48 @@ class KernelLock:
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / "lock"
-        self._file: IO[str] | None = None
+        self._file = -1
+        self._tried = False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        self._tried = False
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
 
     def acquire(self) -> None:
-        """Take the lock; if another process holds it, log that and wait.
-
-        Raises:
-            OSError: the folder cannot be written to.
-        """
-        if self._file is not None:
+        """Take the lock; if another process holds it, log that and wait. Without a lock file, log the reason."""
+        if self._tried:
             return
-        self._file = self._path.open("w")
+        self._tried = True
+        try:
+            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
+            self._wait()
+        except OSError as error:
+            log.warning("%s: %s; kernels are compiled without this lock", self._path, error.strerror)
+
+    def _wait(self) -> None:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             log.info("waiting for another process, which compiles kernels (it holds %s)", self._path)
             waits.set()
             try:
-                fcntl.flock(self._file, fcntl.LOCK_EX)
+                self._take_later()
             finally:
                 waits.clear()
+
+    def _take_later(self) -> None:
+        end = time.monotonic() + MOST_S
+        while time.monotonic() < end:
+            time.sleep(LOOK_S)
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+        log.warning("%s is still held after %.0f s; kernels are compiled without it", self._path, MOST_S)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from daemon.system.traceback_limit import limit_tracebacks
+
 JOURNAL: Final = Path("/run/systemd/journal/socket")
 TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
 PRIORITY: Final = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
@@ -54,6 +56,15 @@ def start_log() -> None:
         handler = JournalHandler(JOURNAL, handler)
         handler.setFormatter(logging.Formatter("%(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
+    limit_tracebacks(handler)
+
+
+def start_command_log() -> None:
+    """Start logging of a command beside the daemon: warnings to stderr, as its other messages."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("lumiloop: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    limit_tracebacks(handler)
 
 
 def to_journal() -> bool:

@@ -10,6 +10,7 @@ from weakref import WeakSet
 import numpy as np
 import numpy.typing as npt
 
+from estimator.job_queue import job_function
 from estimator.measurements import Beam, Beams, Scan
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
@@ -188,6 +189,7 @@ def keep(key: int, T_map: Array, T_odom: Array, scan: Scan, turned_rad: float) -
     )
 
 
+@job_function
 def settle(frames: Sequence[Keyframe], T_odom_submap: Array, sigma: float) -> Settled:
     """Merge the lines of keyframes (at least one) into the content of a submap created at ``T_odom_submap``."""
     local = local_map.empty(np.zeros(2))

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from estimator.job_queue import DRAW
+from estimator.job_queue import DRAW, job_function
 from estimator.mapping.grid_patches import SIDE, UNIT, Cells, Patch, Seen, Tile, compose, render
 from estimator.mapping.keyframe import Keyframe, Submap, hanging
 from estimator.mapping.occupancy_grid import Grid, blank
@@ -237,13 +238,14 @@ def go_on(live: LiveGrid | None, graph: SubmapGraph) -> None:
     detached = math.inf if graph.parts.detached is None else graph.parts.detached
     if live is None or not live.busy(detached) or graph.jobs.busy(live):
         return
-    task = live.task(detached)
+    graph.jobs.ask(DRAW, partial(advance, live.task(detached)), partial(take_drawn, live), owner=live)
 
-    def then(payload: object) -> None:
-        assert isinstance(payload, Progress)
-        live.take(payload)
 
-    graph.jobs.ask(DRAW, lambda: advance(task), then, owner=live)
+@job_function
+def take_drawn(live: LiveGrid, payload: object) -> None:
+    """Apply the result of a job."""
+    assert isinstance(payload, Progress)
+    live.take(payload)
 
 
 def place_of(submap: Submap) -> Place:
@@ -256,6 +258,7 @@ def place_of(submap: Submap) -> Place:
     return Place(submap.place(), None)
 
 
+@job_function
 def advance(task: Task) -> Progress:
     """Render, find what has moved, compose some of the stale tiles; changes nothing but its result."""
     fresh = {}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from estimator.fusion import map_odom_filter
 from estimator.fusion.map_pose import MapPose
 from estimator.fusion.motion_model import Motion
-from estimator.job_queue import SEARCH, SOLVE
+from estimator.job_queue import SEARCH, SOLVE, Owner, job_function
 from estimator.mapping import graph_pose_prior, live_grid
 from estimator.mapping.keyframe import Keyframe, Submap
 from estimator.mapping.loop_verification import Candidate, Found, LoopSettings, look, told_by_light
@@ -24,21 +25,17 @@ from estimator.mapping.map_frame import APART
 from estimator.mapping.map_state import MapState
 from estimator.mapping.pose_graph import UPPER, Graph, Solution, optimise
 from estimator.mapping.relative_covariance import tied
-from estimator.mapping.submap_graph import SOLUTION, SubmapGraph, Waiting
+from estimator.mapping.submap_graph import SubmapGraph, Waiting
 from estimator.measurements import Answer
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array, Ints
 from estimator.numerics.symmetric3 import invert3
 from estimator.result import SURPRISE, Loop, LoopReason
 
-LOOP_SEARCH: Final = "search for a loop"
-"""Owner of the job that searches for a loop."""
-
 PHI: Final = 25.0
 """chi2 of three degrees of freedom at which a loop keeps a quarter of its weight: real maps deform more than noise."""
 
-SETTLED: Final = 1e-5
-MOST: Final = 100
+SETTLED, MOST = 1e-5, 100
 TOGETHER: Final = 60
 """Most keyframes between two loops of one consensus."""
 
@@ -69,7 +66,7 @@ def add_keyframe(map_: MapState, pose: MapPose, frame: Keyframe, odometry: tuple
     before, frames = graph.newest, graph.frames
     graph.add(frame, *odometry)
     live_grid.follow(map_.live, graph, before, frames)
-    if loops is not None and not graph.jobs.busy(LOOP_SEARCH) and graph.since_look >= loops.every:
+    if loops is not None and not graph.jobs.busy(Owner.LOOP_SEARCH) and graph.since_look >= loops.every:
         look_back(graph, pose, loops, frame)
 
 
@@ -79,13 +76,16 @@ def look_back(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame: 
     if not asked:
         return
     graph.since_look = 0
+    then = partial(take_loops, graph, settings, frame)
+    graph.jobs.ask(SEARCH, partial(look, frame, asked, settings), then, owner=Owner.LOOP_SEARCH)
 
-    def then(payload: object) -> None:
-        assert isinstance(payload, tuple)
-        for found in payload:
-            found_again(graph, settings, frame, found)
 
-    graph.jobs.ask(SEARCH, lambda: look(frame, asked, settings), then, owner=LOOP_SEARCH)
+@job_function
+def take_loops(graph: SubmapGraph, settings: LoopSettings, frame: Keyframe, payload: object) -> None:
+    """Apply the result of a search."""
+    assert isinstance(payload, tuple)
+    for found in payload:
+        found_again(graph, settings, frame, found)
 
 
 def candidates(graph: SubmapGraph, pose: MapPose, settings: LoopSettings, frame: Keyframe) -> tuple[Candidate, ...]:
@@ -239,26 +239,31 @@ def solve_graph(map_: MapState, pose: MapPose, motion: Motion) -> None:
     graph = map_.graph
     newest, detached = graph.newest, graph.parts.detached
     begun = newest is not None and (detached is None or newest.key >= detached)
-    if graph.jobs.busy(SOLUTION) or not graph.stale or not begun:
+    if graph.jobs.busy(Owner.SOLUTION) or not graph.stale or not begun:
         return
-    graph.stale = False
-    submaps = tuple(graph.submaps.values())
+    graph.stale, submaps = False, tuple(graph.submaps.values())
     problem = graph_of(graph, pose, submaps)
-
-    def then(payload: object) -> None:
-        assert isinstance(payload, tuple)
-        before, solution, ties = along(submaps, problem.poses, *payload[:2])
-        if correct(map_, pose, motion, submaps, (before, solution)):
-            if payload[2] is not None and lit(pose) and submaps[-1] is graph.newest:
-                graph_pose_prior.take(map_, pose, motion, payload[2])
-            R = se2.rotation(-pose.T_map_odom[2])
-            graph.tied = submaps[-1]
-            turned = R @ ties @ R.T  # all at once: one by one they made this cycle 2 ms longer with 1000 submaps
-            graph.ties = dict(zip([submap.key for submap in submaps], turned, strict=True))
-
-    graph.jobs.ask(SOLVE, lambda: solved(problem), then, owner=SOLUTION)
+    then = partial(take_solution, map_, pose, motion, submaps, problem.poses)
+    graph.jobs.ask(SOLVE, partial(solved, problem), then, owner=Owner.SOLUTION)
 
 
+@job_function
+def take_solution(
+    map_: MapState, pose: MapPose, motion: Motion, submaps: tuple[Submap, ...], before: Array, payload: object
+) -> None:
+    """Apply a solution; ``before``: poses of the submaps, (n, 3), when it was queued."""
+    assert isinstance(payload, tuple)
+    graph, (before, solution, ties) = map_.graph, along(submaps, before, *payload[:2])
+    if correct(map_, pose, motion, submaps, (before, solution)):
+        if payload[2] is not None and lit(pose) and submaps[-1] is graph.newest:
+            graph_pose_prior.take(map_, pose, motion, payload[2])
+        R = se2.rotation(-pose.T_map_odom[2])
+        graph.tied = submaps[-1]
+        turned = R @ ties @ R.T  # all at once: one by one they made this cycle 2 ms longer with 1000 submaps
+        graph.ties = dict(zip([submap.key for submap in submaps], turned, strict=True))
+
+
+@job_function
 def solved(graph: Graph) -> tuple[Solution, Array, graph_pose_prior.Said | None]:
     """The graph's solution, relative covariances of the newest submap (`tied`), and the map's prior of its pose."""
     last = len(graph.poses) - 1

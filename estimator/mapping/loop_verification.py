@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 
+from estimator.job_queue import job_function
 from estimator.mapping.keyframe import Keyframe, Settled, Submap, points_of_frame
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
@@ -159,6 +160,7 @@ class Found:
     alone: bool = True
 
 
+@job_function
 def look(frame: Keyframe, candidates: tuple[Candidate, ...], settings: LoopSettings) -> tuple[Found, ...]:
     """Search a keyframe in each of the candidates."""
     found = (look_in(frame, candidate, settings) for candidate in candidates)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 import numpy as np
 
-from estimator.job_queue import SETTLE, JobQueue
+from estimator.job_queue import SETTLE, JobQueue, Owner, job_function
 from estimator.mapping.constraints import Constraints
 from estimator.mapping.graph_sparsification import handed_on, thinned
 from estimator.mapping.keyframe import ANYWHERE, SIZE, Keyframe, Settled, Submap, settle
@@ -26,9 +27,6 @@ NEAR_M, NEAR_RAD, KEPT = 1.5, 0.25 * math.pi, 2
 
 A grid of positions would fill up for hours instead, because each lap begins its submaps at other positions.
 """
-
-SOLUTION: Final = "solution of the graph"
-"""Owner of the job that solves the graph."""
 
 OWN: Final = 12
 """Submaps of this session kept on top of a restored map that is only used."""
@@ -166,7 +164,7 @@ class SubmapGraph:
         frame.submap = next(reversed(self.submaps.values()))
         self.frames.append(frame)
         self.since_look += 1
-        self.stale |= SOLUTION in self.jobs.count_keyframe()
+        self.stale |= Owner.SOLUTION in self.jobs.count_keyframe()
         if frame.virtual is not None:
             frame.submap.lamps |= frame.virtual.accepted
             T_keyframe_submap = se2.between(T, frame.submap.T_odom_submap)
@@ -230,12 +228,7 @@ class SubmapGraph:
         return loop if np.trace(loop) < np.trace(way) else way
 
     def _settle(self, submap: Submap, frames: tuple[Keyframe, ...], sigma: float) -> None:
-        def then(payload: object) -> None:
-            assert isinstance(payload, Settled)
-            submap.settled = payload
-            self.thin_out(submap)
-
-        self.jobs.ask(SETTLE, lambda: settle(frames, submap.T_odom_submap, sigma), then)
+        self.jobs.ask(SETTLE, partial(settle, frames, submap.T_odom_submap, sigma), partial(take_settled, self, submap))
 
     def thin_out(self, latest: Submap) -> None:
         """Limit the stored data per area: of the submaps at one position and heading the newest few stay."""
@@ -267,6 +260,14 @@ class SubmapGraph:
         submap.hang_on(hub, se2.between(hub.T_map_submap, submap.T_map_submap))
         submap.settled = None
         del self.submaps[submap.key]
+
+
+@job_function
+def take_settled(graph: SubmapGraph, submap: Submap, payload: object) -> None:
+    """Apply the result of finishing a submap."""
+    assert isinstance(payload, Settled)
+    submap.settled = payload
+    graph.thin_out(submap)
 
 
 def alike(one: Submap, other: Submap) -> bool:

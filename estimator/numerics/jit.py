@@ -8,7 +8,7 @@ Every hot function is a plain Python function with this decorator:
   While a background job runs Python, each thread that released the GIL waits for it every time.
 * NaN-safe fast math: without ``nnan`` and ``ninf``, because they fold ``isnan`` to False;
 * ``error_model="numpy"``: division by zero yields inf, as in the slow twin;
-* cached on disk, in the directory of `jit_cache`, and loaded by `jit_cache_load`.
+* cached on disk, in the directory of `jit_cache`, in the files of `jit_cache_file`, and loaded by `jit_cache_load`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import numba
 from numba.core import config
 
 from estimator.numerics.jit_cache import CACHE_DIR
+from estimator.numerics.jit_cache_file import REPLACES_UPSTREAM, KernelCache
 from estimator.numerics.jit_cache_load import loaded
 
 _BLAS: Final = "scipy.linalg.cython_blas"
@@ -54,7 +55,7 @@ def kernel(
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         compiled: Any = numba.njit(
             nogil=aside,
-            cache=True,
+            cache=not REPLACES_UPSTREAM,
             fastmath=FASTMATH,
             error_model="numpy",
             boundscheck=None,
@@ -62,7 +63,10 @@ def kernel(
         )(function)
         if _numba_config.DISABLE_JIT:
             compiled.py_func = function
-        elif inner or inline:
+            return compiled  # type: ignore[no-any-return]  # numba has no types
+        if REPLACES_UPSTREAM:
+            compiled._cache = KernelCache(function)
+        if inner or inline:
             _compile_on_use(compiled, signature)
         else:
             _compile(compiled, signature)

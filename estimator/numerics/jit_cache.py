@@ -5,11 +5,12 @@ cover callees in other files, so an edited callee would leave a stale caller. No
 environment. So each such setting has a directory of its own: ``NUMBA_BOUNDSCHECK=1`` (every index is checked,
 `IndexError`), or ``NUMBA_CPU_NAME=generic`` (baseline instructions of the architecture only).
 
-This is the only module of the estimator that touches the file system; it does so once, when first imported.
+It touches the file system once, when first imported.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
@@ -53,11 +54,19 @@ def source_key() -> str:
 
 
 def _writable(directory: Path) -> bool:
-    """Whether a file can be created there. numba silently ignores a cache directory it cannot write to."""
+    """Whether a file can be created there."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=directory):
             return True
+    except OSError:
+        return False
+
+
+def _has_kernels(directory: Path) -> bool:
+    """Whether a directory contains compiled kernels that this process can list."""
+    try:
+        return any(directory.glob("*/*.nbi"))
     except OSError:
         return False
 
@@ -70,7 +79,8 @@ def _cache_roots() -> list[Path]:
     roots = [Path(name) for name in named]
     if home:
         roots.append(Path(home) / "lumiloop")
-    roots.append(Path(tempfile.gettempdir()) / f"lumiloop-{os.getuid()}")
+    with contextlib.suppress(OSError):  # no temporary directory can be written to
+        roots.append(Path(tempfile.gettempdir()) / f"lumiloop-{os.getuid()}")
     return roots
 
 
@@ -92,19 +102,24 @@ def _prune(root: Path, ours: Path) -> None:
 
 
 def _choose_cache() -> Path:
-    """First cache root that is writable, with the directory of these sources; removes old directories when it is new.
+    """Directory of these sources in the first cache root that contains kernels of them or is writable.
+
+    A full or read-only disk with kernels thus serves as it is. Old directories are removed where this one is new.
 
     Raises:
-        RuntimeError: no root is writable.
+        RuntimeError: no root is writable, and none contains kernels of these sources.
     """
     key = source_key()
     for root in _cache_roots():
         directory = root / f"kernels-{key}"
-        is_new = not directory.exists()
+        is_new = not os.access(directory, os.F_OK)
         if _writable(directory):
-            os.utime(directory)  # marks the last use
+            with contextlib.suppress(OSError):  # the directory of another user
+                os.utime(directory)  # marks the last use
             if is_new:
                 _prune(root, directory)
+            return directory
+        if _has_kernels(directory):
             return directory
     raise RuntimeError("no writable directory for compiled kernels; set NUMBA_CACHE_DIR to one")
 

@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 
+from estimator.job_queue import job_function
 from estimator.mapping.keyframe import Keyframe, Settled, points_of_frame
 from estimator.mapping.loop_verification import LoopSettings
 from estimator.numerics import se2
@@ -164,6 +165,7 @@ class Looked:
         return self.nodes + FIT_NODES * self.fits
 
 
+@job_function
 def look(query: Query, settings: LoopSettings) -> Looked:
     """Search a keyframe in the whole map."""
     terrain = terrain_of(query.pieces, query.before)

@@ -28,7 +28,7 @@ from estimator.fusion import light_witness
 from estimator.fusion.light_witness import light_holds
 from estimator.fusion.motion_model import too_far
 from estimator.fusion.pose_update import BLIND, noise_of
-from estimator.job_queue import SEARCH
+from estimator.job_queue import SEARCH, job_function
 from estimator.mapping import keyframe
 from estimator.measurements import Odometry, Scan
 from estimator.numerics import se2
@@ -273,6 +273,7 @@ def look(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> N
         doubt.since = 0
 
 
+@job_function
 def answered(state: Owners, asked: Question, payload: object) -> None:
     """Start relocalisation if the pose is not unique, or is not confirmed after a jump.
 

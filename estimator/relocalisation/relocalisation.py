@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from estimator.fusion.light_witness import blind, light_holds
-from estimator.job_queue import SEARCH
+from estimator.job_queue import SEARCH, job_function
 from estimator.mapping import live_grid
 from estimator.mapping.keyframe import Keyframe, Submap
 from estimator.mapping.map_frame import relist, unlist
@@ -346,6 +346,7 @@ def windows(state: Owners, frame: Keyframe) -> tuple[Around, ...] | None:
     return tuple(Around(np.array((one.x, one.y, 0.0)), one.reach_m + lever, math.pi) for one in allowed) or None
 
 
+@job_function
 def take_look(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ...], payload: object) -> None:
     """Apply the result of a search, and accept a hypothesis if it is decided."""
     assert isinstance(payload, Looked)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Final
 
-from estimator.job_queue import SEARCH
+from estimator.job_queue import SEARCH, job_function
 from estimator.mapping.keyframe import Keyframe
 from estimator.relocalisation import relocalisation, unaligned_map
 from estimator.relocalisation.global_scan_match import Looked, Piece, Query, Verdict, look
@@ -35,7 +35,7 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
     if pieces:
         guess = (frame.T_map_keyframe,)
         query = Query(frame, pieces, watch.terrain, guess, (), search=False, outvoted=lit(state))
-        graph.jobs.ask(SEARCH, partial(look, query, told), partial(take, state, watch), owner=watch)
+        graph.jobs.ask(SEARCH, partial(look, query, told), partial(take_check, state, watch), owner=watch)
 
 
 def lit(state: Owners) -> bool:
@@ -47,7 +47,8 @@ def lit(state: Owners) -> bool:
     return witness(state.light, state.map.graph, state.pose.here(state.motion.T_odom_base))
 
 
-def take(state: Owners, watch: Watch, payload: object) -> None:
+@job_function
+def take_check(state: Owners, watch: Watch, payload: object) -> None:
     """Apply the result of a check."""
     assert isinstance(payload, Looked)
     (fit,), watch.terrain = payload.guesses, payload.terrain

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimator.fusion.light_witness import KNOWN, light_holds
+from estimator.job_queue import job_function
 from estimator.mapping import live_grid
 from estimator.mapping.keyframe import SIZE, Keyframe
 from estimator.mapping.map_frame import relist
@@ -95,7 +96,7 @@ def keyframe_laid(state: Owners, frame: Keyframe) -> None:
         parts.aside = None
         state.relocalisation.maps_dropped += 1
         return
-    hand_out(state, aside.search, frame, aside.submaps.values(), None, take)
+    hand_out(state, aside.search, frame, aside.submaps.values(), None, take_aside)
 
 
 def enough(keyframe_m: float, aside: SearchedAside) -> float:
@@ -103,7 +104,8 @@ def enough(keyframe_m: float, aside: SearchedAside) -> float:
     return min(max(LEAST_M, len(aside.submaps) * SIZE * keyframe_m), MOST_M)
 
 
-def take(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ...], payload: object) -> None:
+@job_function
+def take_aside(state: Owners, seek: Seek, frame: Keyframe, asked: tuple[Hypothesis, ...], payload: object) -> None:
     """Apply the result of a search, and accept a hypothesis if it is decided."""
     assert isinstance(payload, Looked)
     aside = state.map.parts.aside

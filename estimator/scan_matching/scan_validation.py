@@ -1,7 +1,8 @@
 """Scan validation: rejects scans that no lidar can have measured, with a reason, before any computation.
 
 A non-finite bearing or mount would become an array index in the kernels. At an angle of millions of turns rounding
-merges the beams into a scan that fits anywhere. Arrays of different lengths, or a scan that ends before it begins, are
+merges the beams into a scan that fits anywhere. So do beams that all have about one bearing: their ends lie on a line,
+which fits every wall. Arrays of different lengths, or a scan that ends before it begins, are
 program errors.
 """
 
@@ -24,6 +25,11 @@ LATEST_S = 1e11
 """Largest plausible instant, s: about three thousand years from the zero of a clock."""
 FULL_TURN = 2.0 * math.pi + 0.1
 """Largest span of the bearings of one scan, and largest magnitude of a bearing or of a mount's yaw, rad."""
+
+NARROWEST = 0.5
+"""Smallest field of a scan, rad: a third of the narrowest lidar's, and of a depth camera's that is used as one."""
+FEW = 32
+"""Beams up to which a scan may be narrower, because the matcher finds too few points in it."""
 
 
 def refused(matching: MatchMemory, scan: Scan) -> Reason | None:
@@ -51,16 +57,22 @@ def well_formed(scan: Scan) -> bool:
 
 
 def even(matching: MatchMemory, bearing: Array) -> bool:
-    """Whether bearings are monotonic and within a turn; an array that several scans share is checked once."""
+    """Whether bearings are monotonic, spread, and within a turn; an array that several scans share is checked once."""
     if bearing is matching.bearing_rad or len(bearing) < 2:
         return True
     steps = np.diff(bearing) if np.isfinite(bearing).all() else np.zeros(1)
     one_way = bool((steps > 0.0).all() or (steps < 0.0).all())
     first, last = float(bearing[0]), float(bearing[-1])
-    if not one_way or max(abs(first), abs(last), abs(last - first)) > FULL_TURN:
+    if not one_way or narrow(bearing) or max(abs(first), abs(last), abs(last - first)) > FULL_TURN:
         return False
     matching.bearing_rad = bearing
     return True
+
+
+def narrow(bearing: Array) -> bool:
+    """Whether half of the beams or more lie within half of the smallest field."""
+    n = len(bearing)
+    return n > FEW and abs(float(bearing[(3 * n) // 4] - bearing[n // 4])) < 0.49 * NARROWEST
 
 
 def nothing_of(scan: Scan) -> ScanPoints:

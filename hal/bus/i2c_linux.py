@@ -25,6 +25,7 @@ from typing import Final, cast
 
 from smbus2 import I2cFunc, SMBus, i2c_msg
 
+from hal.bus.address_lock import taken
 from hal.bus.i2c import Message, Transferred, check
 from hal.errors import KEPT_AWAY, DeviceMissing, DeviceRefused, HalError
 
@@ -117,7 +118,7 @@ def _claim(fd: int, address: int) -> None:
     try:
         _lock(fd, fcntl.F_WRLCK, address, 1)
     except BlockingIOError:
-        raise OSError(errno.EBUSY, f"address {address:#04x} is in use by another program") from None
+        raise taken(address) from None
 
 
 def _lock(fd: int, kind: int, start: int, length: int) -> None:

@@ -1,6 +1,7 @@
 """Client of a remote I2C bus (``unix:/path``, ``tcp://host:port``); the protocol is in :mod:`hal.bus.i2c_frames`.
 
-A repeated transaction is sent one ahead, so that the bus does not wait for this process between two blocks.
+The first bus that uses an address claims it until it is closed, as on a local bus (:mod:`hal.bus.address_lock`). A
+repeated transaction is sent one ahead, so that the bus does not wait for this process between two blocks.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from hal.bus import i2c_frames as frames
+from hal.bus.address_lock import AddressLocks
 from hal.bus.i2c import Message, Transferred, check
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 
@@ -103,6 +105,7 @@ class RemoteBus:
         self._pending: dict[int, _Request] = {}
         self._early: dict[int, frames.Done] = {}
         self._number = 0
+        self._locks = AddressLocks(name)
         greeting = self._greeting()
         self._about = greeting.about
         self._clock = RemoteClock(same=greeting.clock == clock_name() != "")
@@ -136,18 +139,22 @@ class RemoteBus:
 
     def release(self) -> None:
         """Shut the connection down: the server releases the bus, and a pending read here fails."""
+        self._locks.release()
         if (link := self._link) is not None:
             with contextlib.suppress(OSError):  # it has been closed meanwhile
                 link.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Close the connection."""
+        self._locks.release()
         link, self._link = self._link, None
         if link is not None:
             link.close()
 
     def _send(self, messages: tuple[Message, ...]) -> int:
         check(messages)
+        for message in messages:
+            self._locks.claim(message.address)
         self._number = (self._number + 1) & 0xFFFFFFFF
         lengths = tuple(message.length for message in messages if message.length)
         self._pending[self._number] = _Request(time.monotonic(), lengths)

@@ -1,15 +1,18 @@
 """The HOKUYO driver: finds the sensor, streams, and recovers from failures of sensor and cable.
 
-Recovery escalates with each failure since the last valid scans: restart the stream (QT), reset the sensor (RT or RS),
-reopen the port, reboot the sensor (RB, where the model has it), then reopen again. Only valid scans reset it: a sensor
-that opens but never delivers must not look healthy (Hokuyo-aut/urg_node2 pull request 5). Pauses grow from 0.2 to 5 s;
-the driver never gives up.
+Recovery escalates with each failed stream since the last valid scans: restart the stream (QT), reset the sensor (RT or
+RS), reopen the port. A lasting trouble is answered by reboots at growing distances (RB; a reset where the model has
+none). Only valid scans end it: a sensor that opens but never delivers must not look healthy (Hokuyo-aut/urg_node2 pull
+request 5). A sensor that refuses to measure for now is asked again every second, without resets. Attempts begin 0.2 to
+4 s apart; the driver never gives up.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import math
 import random
 from collections.abc import Callable
 from functools import partial
@@ -20,9 +23,11 @@ from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.hokuyo import discover
 from hal.hokuyo.models import Identity, line_speed, stream_request
 from hal.hokuyo.payload import ScanRequest
+from hal.hokuyo.reboot_pacing import RebootPacing
 from hal.hokuyo.scip import BAUD_RATES
 from hal.hokuyo.scip_line import Line
-from hal.hokuyo.session import AbnormalState, Session
+from hal.hokuyo.sensor_errors import AbnormalState, NotReady
+from hal.hokuyo.session import Session
 from hal.hokuyo.stream import ScanStream
 from hal.hokuyo.stream_watch import StreamWatch
 from hal.lidar import LidarGeometry, LidarStatus, Link, RawScan
@@ -33,10 +38,11 @@ log = logging.getLogger(__name__)
 
 AUTO: Final = "auto"
 _USB_BAUD: Final = 115200  # ignored by USB, but a tty needs a rate
-_PAUSE_S: Final = (0.2, 5.0)
-_RESET_FROM: Final = 2  # failures since the last run of valid scans
+_PAUSE_S: Final = (0.2, 4.0)
+_READY_PAUSE_S: Final = 1.0  # while the sensor refuses to measure for now
+_RESET_FROM: Final = 2  # failed streams since the last run of valid scans
 _REOPEN_FROM: Final = 3
-_REBOOT_EVERY: Final = 4
+_REBOOT_FROM: Final = 4
 _GOOD_RUN: Final = 10  # valid scans of one stream
 _CALM_S: Final = 30.0  # of streaming, after which a problem is logged again
 
@@ -79,6 +85,8 @@ class HokuyoDriver:
         self._geometry: LidarGeometry | None = None
         self._faults = 0
         self._attempts = 0
+        self._t_attempt = -math.inf
+        self._reboots = RebootPacing()
         self._opened = False
         self._rate_cap = max(BAUD_RATES)
         self._rate_found = 0
@@ -106,6 +114,7 @@ class HokuyoDriver:
     async def _connection(self, on_scan: Callable[[RawScan], None]) -> None:
         """Open, stream, and recover on the open port; returns or raises when the port must be reopened."""
         self._status.link = Link.OPENING
+        self._t_attempt = self._clock.now()
         session = await self._find()
         if self._opened:
             self._status.reconnects += 1
@@ -117,7 +126,10 @@ class HokuyoDriver:
                 except DeviceMissing:
                     raise
                 except HalError as error:
+                    error = await session.with_report(error)
                     self._note(error)
+                    if not isinstance(error, (DeviceRefused, NotReady)):
+                        self._faults += 1
                     if not await self._mend(session, error):
                         return
         except asyncio.CancelledError:
@@ -132,11 +144,14 @@ class HokuyoDriver:
         self._status.resyncs += 1
         identity = session.identity
         assert identity is not None
-        turn_of_reboot = self._faults > 0 and self._faults % _REBOOT_EVERY == 0
-        if isinstance(error, AbnormalState) or (turn_of_reboot and identity.facts.allows("RB")):
-            await session.reboot()
+        grave = isinstance(error, (AbnormalState, NotReady)) or self._faults >= _REBOOT_FROM
+        if grave and await self._rebooted(session, error):
             return False
-        if self._faults >= _REOPEN_FROM or isinstance(error, DeviceRefused):
+        if isinstance(error, NotReady):
+            await asyncio.sleep(_READY_PAUSE_S)
+            await session.leave_time_adjust()
+            return True
+        if self._faults >= _REOPEN_FROM or isinstance(error, (AbnormalState, DeviceRefused)):
             return False
         await asyncio.sleep(self._pause())
         if session.baud:
@@ -145,6 +160,18 @@ class HokuyoDriver:
         if self._faults >= _RESET_FROM:
             await session.reset()
         await self._suit_rate(session, identity)
+        return True
+
+    async def _rebooted(self, session: Session, error: HalError) -> bool:
+        """Reboot the sensor where that is due, or reset one without RB; returns whether it was."""
+        if not self._reboots.is_due(error, self._clock.now()):
+            return False
+        if isinstance(error, AbnormalState) or (session.identity and session.identity.facts.allows("RB")):
+            await session.reboot()
+        else:
+            with contextlib.suppress(DeviceFault):
+                await session.reset()
+        self._reboots.add_reboot(self._clock.now())
         return True
 
     async def _find(self) -> Session:
@@ -160,7 +187,8 @@ class HokuyoDriver:
         wanted = f"no HOKUYO {self._serial} found" if self._serial else "no HOKUYO found"
         if not problems:
             raise DeviceMissing(AUTO, wanted, "plug the sensor in, or name its device file")
-        kind = next((type(e) for e in problems if isinstance(e, DeviceRefused)), type(problems[0]))
+        telling = (type(e) for kind in (NotReady, DeviceRefused) for e in problems if isinstance(e, kind))
+        kind = next(telling, type(problems[0]))
         raise kind(AUTO, f"{wanted}: {'; '.join(map(str, problems))}")
 
     async def _open(self, device: str) -> Session:
@@ -168,34 +196,42 @@ class HokuyoDriver:
         rs232 = discover.is_rs232(device, self._baud)
         port = await self._opener(device, self._rate_found or self._baud or (BAUD_RATES[0] if rs232 else _USB_BAUD))
         session = Session(Line(port))
+        identity: Identity | None = None
         try:
-            if rs232:
-                await session.find_rate(self._rate_found or self._baud)
-            await self._settle(session)
-            if self._faults >= _REOPEN_FROM:
-                await session.reset()
-            identity = await session.identify()
-            serial = identity.geometry.serial
-            if self._serial and serial != self._serial:
-                raise DeviceRefused(device, f"is sensor {serial}, not {self._serial}", f'set device = "{AUTO}"')
-            await self._suit_rate(session, identity)
+            identity = await self._identify(session, rs232)
         except asyncio.CancelledError:
             await session.quiet()
-            session.line.close()
             raise
-        except HalError:
-            session.line.close()
-            raise
+        finally:
+            if identity is None:
+                session.line.close()
         self._geometry = identity.geometry
         self._describe(device, session, identity)
         return session
 
-    async def _settle(self, session: Session) -> None:
+    async def _identify(self, session: Session, rs232: bool) -> Identity:
+        """Prepare the sensor; where it refuses that, add its own report to the error, and reboot it if that is due."""
         try:
-            await session.settle()
-        except AbnormalState:
-            await session.reboot()
-            raise
+            return await self._prepare(session, rs232)
+        except (AbnormalState, NotReady) as error:
+            reported = self._status.error = await session.with_report(error)
+            await self._rebooted(session, reported)
+            raise reported from error
+
+    async def _prepare(self, session: Session, rs232: bool) -> Identity:
+        """Bring the sensor to idle, identify it, and set the line rate."""
+        if rs232:
+            await session.find_rate(self._rate_found or self._baud)
+        await session.settle()
+        if self._faults >= _REOPEN_FROM:
+            await session.reset()
+        identity = await session.identify()
+        serial = identity.geometry.serial
+        if self._serial and serial != self._serial:
+            other = f"is sensor {serial}" if serial else "gives no readable serial number"
+            raise DeviceRefused(session.device, f"{other}, not {self._serial}", f'set device = "{AUTO}"')
+        await self._suit_rate(session, identity)
+        return identity
 
     async def _suit_rate(self, session: Session, identity: Identity) -> None:
         """RS-232: change to the configured rate, or to the lowest that carries every revolution."""
@@ -218,7 +254,7 @@ class HokuyoDriver:
     def _describe(self, device: str, session: Session, identity: Identity) -> None:
         facts = {"device": device, "model": identity.geometry.model, "serial": identity.geometry.serial}
         facts["firmware"] = identity.geometry.firmware
-        facts["state"] = session.health
+        facts["state"] = session.report.health
         if session.baud:
             facts["baud"] = str(session.baud)
         self._status.extra.update(facts)
@@ -267,6 +303,7 @@ class HokuyoDriver:
             self._status.link = Link.STREAMING
             if count == _GOOD_RUN:
                 self._faults = self._attempts = 0
+                self._reboots.add_success(scan.t_rx)
                 if self._loss_logged or not self._announced:
                     word = "delivers again" if self._loss_logged else f"(serial {scan.geometry.serial}) delivers"
                     log.info("%s: lidar %s %s", self._status.extra["device"], scan.geometry.model, word)
@@ -286,15 +323,17 @@ class HokuyoDriver:
         """
         self._status.error = error
         self._attempts += 1
-        if not isinstance(error, (DeviceMissing, DeviceRefused)):
-            self._faults += 1
+        self._reboots.add_failure(error, self._clock.now())
         if error.problem not in self._logged:
             self._logged.add(error.problem)
             self._loss_logged = True
             log.info("lidar lost: %s", error)
 
     def _pause(self) -> float:
-        """Seconds until the next attempt: doubling, with jitter against synchronised hosts."""
+        """Seconds until the next attempt: attempts begin at doubling distances, with jitter between hosts."""
         low, high = _PAUSE_S
-        pause = min(low * 2.0 ** min(max(self._attempts - 1, 0), 10), high)
-        return pause * self._random.uniform(0.8, 1.0)
+        apart = min(low * 2.0 ** min(max(self._attempts - 1, 0), 10), high)
+        if isinstance(self._status.error, NotReady):
+            apart = low + _READY_PAUSE_S
+        left = apart - (self._clock.now() - self._t_attempt)
+        return max(left, low) * self._random.uniform(0.8, 1.0)

@@ -10,6 +10,9 @@ import re
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+import numpy as np
+import numpy.typing as npt
+
 from hal.errors import DeviceRefused
 from hal.hokuyo.payload import ScanRequest
 from hal.lidar import LidarGeometry
@@ -43,6 +46,12 @@ _UTM_CODES: Final = {
 }
 
 
+NEAREST_MM: Final = 20
+"""No model measures below this; smaller values are error codes even where DMIN allows them (C-42-03320B: 0 to 19)."""
+NO_RETURN: Final = (65533, 65534, 65535, 0x3FFFF)
+"""Words for a missing echo or an error, and all bits set; no distances even where DMAX allows them."""
+
+
 @dataclass(frozen=True, slots=True)
 class ModelFacts:
     """Facts of a family of sensors.
@@ -52,7 +61,7 @@ class ModelFacts:
         commands: two-letter commands that are safe to send; old firmware wedges on others until a power cycle
             (ros-drivers/urg_c PR 4, ros-drivers/urg_node issue 23).
         codes: meaning of values below DMIN.
-        no_return_from: values from here on are no distance even if DMAX allows them; 0: DMAX alone decides.
+        no_return_from: values from here on are no distance even if DMAX allows them; 0: DMAX and NO_RETURN decide.
         line: usual connection, where the port's name does not show it.
         intensity_swath_deg: widest safe field of view with intensity at cluster 1, by firmware; "" is any other
             firmware. Empty: no limit.
@@ -75,11 +84,17 @@ _FAMILIES: Final[tuple[tuple[str, ModelFacts], ...]] = (
     ("URG-04LX", ModelFacts("URG-04LX", _CORE, _URG_CODES)),
     ("UBG-04LX", ModelFacts("UBG-04LX", _CORE, _URG_CODES)),
     ("UHG-08LX", ModelFacts("UHG-08LX", _CORE, _URG_CODES)),
-    ("UTM-30LX-EW", ModelFacts("UTM-30LX-EW", _MULTI_ECHO, _UTM_CODES, line="ethernet")),
+    ("UTM-30LX-EW", ModelFacts("UTM-30LX-EW", _MULTI_ECHO, _UTM_CODES, no_return_from=65533, line="ethernet")),
     (
         "UTM-30LX",
         # hokuyo_node and PR2/pr2_robot issue 137: a wider request gives wrong data or a crash that needs a power cycle
-        ModelFacts("UTM-30LX", _INTENSITY, _UTM_CODES, intensity_swath_deg={"": 95.0, "1.16.01(16/Nov./2009)": 190.0}),
+        ModelFacts(
+            "UTM-30LX",
+            _INTENSITY,
+            _UTM_CODES,
+            no_return_from=65533,
+            intensity_swath_deg={"": 95.0, "1.16.01(16/Nov./2009)": 190.0},
+        ),
     ),
     ("UST-", ModelFacts("UST", _INTENSITY | {"RB"}, _UTM_CODES, no_return_from=65533, line="ethernet")),
     ("UXM-30LX", ModelFacts("UXM-30LX", _MULTI_ECHO, _UTM_CODES, line="ethernet")),
@@ -109,14 +124,25 @@ class Identity:
     geometry: LidarGeometry
     facts: ModelFacts
 
+    def is_distance(self, values: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
+        """Mask of the values that are distances, of any shape; all others are codes, whatever DMIN and DMAX are."""
+        highest = min(self.geometry.dmax, (self.facts.no_return_from or 0x3FFFF) - 1)
+        found = (values >= max(self.geometry.dmin, NEAREST_MM)) & (values <= highest)
+        for word in NO_RETURN:
+            if word <= highest:
+                found &= values != word
+        return np.asarray(found)
+
     def code_text(self, value: int) -> str:
         """Meaning of a value that is no distance, for people."""
-        if value > self.geometry.dmax:
+        if value > self.geometry.dmax or value >= NO_RETURN[0]:
             return "no return"
         return self.facts.codes.get(value, "error code without published meaning")
 
 
-_NUMBER: Final = re.compile(r"[0-9]{1,9}")
+_UNIT: Final = r"\s*(?:[\[(<{].*|[A-Za-z/%.]+(?:[\s,;\[(<{].*)?)?"
+_NUMBER: Final = re.compile(rf"([+-]?[0-9]{{1,9}}(?:\.[0-9]{{1,9}})?){_UNIT}", re.DOTALL)
+"""A decimal number with or without its unit: ``2400``, ``2400[rpm]``, ``60000 mm``."""
 _PP_NUMBERS: Final = ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")
 
 
@@ -126,16 +152,12 @@ def identify(device: str, vv: dict[str, str], pp: dict[str, str]) -> Identity:
     Raises:
         DeviceRefused: PP lacks a key or contradicts itself, or the firmware is older than SCIP 2.0.
     """
-    numbers: dict[str, int] = {}
-    for key in _PP_NUMBERS:
-        text = pp.get(key, "")
-        if not _NUMBER.fullmatch(text):
-            raise DeviceRefused(device, f"PP says {key}={text[:20]!r}, expected a number", "is this a HOKUYO 2D lidar?")
-        numbers[key] = int(text)
-    ares, amin, amax = numbers["ARES"], numbers["AMIN"], numbers["AMAX"]
-    if not (numbers["SCAN"] > 0 and 0 <= amin < amax <= ares <= 9999 and amin <= numbers["AFRT"] <= amax):
-        raise DeviceRefused(device, f"PP contradicts itself: {pp}", "is this a HOKUYO 2D lidar?")
-    if not numbers["DMIN"] < numbers["DMAX"] <= 0x3FFFF:
+    numbers = {key: _number(device, key, pp.get(key, "")) for key in _PP_NUMBERS}
+    ares, amin, amax = (_whole(device, key, numbers[key]) for key in ("ARES", "AMIN", "AMAX"))
+    dmin, dmax = (_whole(device, key, numbers[key]) for key in ("DMIN", "DMAX"))
+    dmax = min(dmax, 0x3FFFF)  # the largest value that a reply can carry
+    front = abs(numbers["AFRT"]) <= 2 * ares  # it may lie outside the field of view
+    if not (numbers["SCAN"] > 0 and 0 <= amin < amax <= ares <= 9999 and front and 0 <= dmin < dmax):
         raise DeviceRefused(device, f"PP contradicts itself: {pp}", "is this a HOKUYO 2D lidar?")
     period_s = 60.0 / numbers["SCAN"]
     product, firmware = vv.get("PROD", ""), vv.get("FIRM", "")
@@ -151,13 +173,27 @@ def identify(device: str, vv: dict[str, str], pp: dict[str, str]) -> Identity:
         afrt=numbers["AFRT"],
         amin=amin,
         amax=amax,
-        dmin=numbers["DMIN"],
-        dmax=numbers["DMAX"],
+        dmin=dmin,
+        dmax=dmax,
         range_unit_m=0.001,
         period_s=period_s,
         beam_dt_s=period_s / ares,
     )
     return Identity(product, vv.get("PROT", ""), geometry, facts)
+
+
+def _number(device: str, key: str, text: str) -> float:
+    """The number in a value of PP, without its unit; raises `DeviceRefused`."""
+    found = _NUMBER.fullmatch(text)
+    if found is None:
+        raise DeviceRefused(device, f"PP says {key}={text[:20]!r}, expected a number", "is this a HOKUYO 2D lidar?")
+    return float(found[1])
+
+
+def _whole(device: str, key: str, value: float) -> int:
+    if not value.is_integer():
+        raise DeviceRefused(device, f"PP says {key}={value:g}, expected a whole number", "is this a HOKUYO 2D lidar?")
+    return int(value)
 
 
 def stream_request(identity: Identity, *, intensity: bool, bytes_per_s: float) -> ScanRequest:

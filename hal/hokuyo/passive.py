@@ -39,6 +39,8 @@ class PassiveHokuyo:
         self._splitter = FrameSplitter()
         self._identity = None if geometry is None else _given(geometry)
         self._vv: dict[str, str] = {}
+        self._pp: dict[str, str] = {}
+        self._doubted = b""
         self._stream: ScanStream | None = None
         self._seq = 0
         self._status = LidarStatus(dialect="SCIP 2 capture")
@@ -81,10 +83,17 @@ class PassiveHokuyo:
         return scans
 
     def _learn(self, reply: Reply) -> None:
+        """Take up the lines of VV or PP; unreadable ones only when the same bytes come again, as the live driver does.
+
+        Nothing in VV is needed to measure, so that its lines are taken as far as they are readable.
+        """
         if reply.echo == b"VV":
             self._vv = parse_text(reply, strict=False)
         elif reply.echo == b"PP":
-            identity = identify(self._device, self._vv, parse_text(reply))
+            strict, self._doubted = reply.body != self._doubted, reply.body
+            self._pp = parse_text(reply, strict=strict)
+        if reply.echo in (b"VV", b"PP") and self._pp:
+            identity = identify(self._device, self._vv, self._pp)
             if identity != self._identity:
                 self._identity, self._stream = identity, None
 

@@ -106,6 +106,11 @@ class ScanRequest:
         return steps // self.stride, -(-steps // self.stride)
 
     @property
+    def whole_groups(self) -> int:
+        """Beams with a full group of steps. An incomplete last group has its middle elsewhere and is left out."""
+        return max(1, self.beams[0])
+
+    @property
     def echo(self) -> bytes:
         """The command line without LF, as the acknowledgement repeats it."""
         line = b"%s%04d%04d%02d" % (self.name.encode(), self.start, self.end, self.cluster)

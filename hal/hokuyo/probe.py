@@ -80,5 +80,10 @@ async def identify_at(opener: PortOpener, device: str, baud: int = 0) -> Finding
     except HalError as error:
         return Finding(device, error=error)
     return Finding(
-        device, identity.geometry, identity.product, identity.protocol, session.health, session.baud if rs232 else 0
+        device,
+        identity.geometry,
+        identity.product,
+        identity.protocol,
+        session.report.health,
+        session.baud if rs232 else 0,
     )

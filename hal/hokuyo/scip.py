@@ -23,7 +23,8 @@ ACCEPTED: Final = "00"
 DATA: Final = "99"
 RESUMED: Final = "98"  # streaming again after a self-check
 ABNORMAL: Final = "0L"  # SCIP 2.2: only RB and state queries are accepted
-DENIED: Final = frozenset({"0E", "10"})  # refused at present: typical of time-adjust mode
+UNSTABLE: Final = "0M"  # SCIP 2.2: not stable yet after the start
+NOT_NOW: Final = frozenset({"0E", "10", UNSTABLE})  # refused at present: time-adjust mode, or starting up
 
 VV: Final = b"VV\n"
 PP: Final = b"PP\n"
@@ -77,6 +78,7 @@ def decode_number(chars: bytes) -> int:
 
 
 _STATUS = re.compile(rb"[0-9][0-9A-Z]")  # stricter than the sum, which ignores bits 6 and 7
+_UNPRINTABLE = re.compile(rb"[^ -~]")
 _TAG = re.compile(rb"[A-Za-z0-9 ._+@]{0,16}\Z")
 
 
@@ -203,27 +205,38 @@ def parse_text(reply: Reply, *, strict: bool = True) -> dict[str, str]:
     """``KEY:value;s`` lines of VV, PP and II.
 
     Firmware versions differ in the summed bytes: without the ``;`` (the rule), with it, or up to ``<-``; all are valid.
-    A line without a colon is skipped. ``value`` may contain ``;``: the last one ends it.
+    A line without a colon is skipped. ``value`` may contain ``;``: the last one ends it. A character that is not
+    printable ASCII becomes ``?``.
 
     Args:
         reply: an accepted reply.
-        strict: False accepts lines whose sum fits none of the three (after the same bytes came twice).
+        strict: False accepts what a firmware sends repeatedly (the same bytes came twice): lines whose sum fits none of
+            the three, and bytes above 127, as in a vendor's name. Lines without an end are then skipped.
 
     Raises:
-        BadFrame: SUM, TEXT.
+        BadFrame: SUM, TEXT, CHARACTER; only where ``strict``.
     """
     found: dict[str, str] = {}
-    for line in reply.body.splitlines():
-        if len(line) < 2 or line[-2:-1] != b";":
-            raise BadFrame(Flaw.TEXT, repr(line[:40]))
-        if not line.isascii():
-            raise BadFrame(Flaw.CHARACTER, repr(line[:40]))
-        if strict and line[-1] not in _text_sums(line):
-            raise BadFrame(Flaw.SUM, f"text line {line!r}")
+    for line in reply.body.removesuffix(b"\n").split(b"\n") if reply.body else ():
+        if strict:
+            _check_text(line)
         key, colon, value = line[:-2].partition(b":")
-        if colon:
-            found[key.decode("ascii").strip()] = value.decode("ascii").strip()
+        if colon and line[-2:-1] == b";":
+            found[_readable(key)] = _readable(value)
     return found
+
+
+def _check_text(line: bytes) -> None:
+    if len(line) < 2 or line[-2:-1] != b";":
+        raise BadFrame(Flaw.TEXT, repr(line[:40]))
+    if not line.isascii():
+        raise BadFrame(Flaw.CHARACTER, repr(line[:40]))
+    if line[-1] not in _text_sums(line):
+        raise BadFrame(Flaw.SUM, f"text line {line!r}")
+
+
+def _readable(text: bytes) -> str:
+    return _UNPRINTABLE.sub(b"?", text.strip()).decode("ascii")
 
 
 def _text_sums(line: bytes) -> set[int]:

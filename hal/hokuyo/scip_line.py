@@ -68,11 +68,15 @@ class Line:
         if self._lost is not None:
             raise self._lost
         self._echo = command.strip(b"\n")
-        self._reply = asyncio.get_running_loop().create_future()
+        reply: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+        self._reply = reply
         try:
             self.port.write(b"\n" + command)
-            async with asyncio.timeout(timeout_s):
-                return await self._reply
+            # asyncio.timeout() of Python 3.11.2 raises CancelledError where the task has been cancelled before
+            await asyncio.wait({reply}, timeout=timeout_s)
+            if not reply.done():
+                raise TimeoutError
+            return reply.result()
         finally:
             self._reply = None
 

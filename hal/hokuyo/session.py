@@ -18,15 +18,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from hal.errors import DataInvalid, DeviceFault, DeviceRefused, HalError
+from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.hokuyo import scip
 from hal.hokuyo.models import BEFORE_IDENTIFIED, Identity, ModelFacts, identify
 from hal.hokuyo.payload import ScanRequest, parse_scan
 from hal.hokuyo.scip import BadFrame, Reply, parse_reply, parse_text
 from hal.hokuyo.scip_line import Line, OnFrame, legible, printable, reply_or_none
+from hal.hokuyo.sensor_errors import POWER_CYCLE, AbnormalState, NotReady, SelfReport, explain_status
 
 QUIET_S: Final = 0.1
 FIRST_SCAN_S: Final = 6.0  # the motor takes 2 to 5 s to spin up after power-on
@@ -40,14 +42,11 @@ _RESET_S: Final = 1.5
 _AFTER_RESET_S: Final = 1.0
 _AFTER_RATE_S: Final = 0.15
 _AFTER_REBOOT_S: Final = 2.0
-_POWER_CYCLE: Final = "switch its power off and on"
+_REPORT_S: Final = 5.0
+"""II is queried no more often than this after failures: old firmware fails under many queries (urg_c PR 4)."""
 _NO_ANSWER: Final = "is it a HOKUYO, powered, its cable right?"
 _UNREADABLE: Final = "only unreadable bytes come"
 _OTHER_PORT: Final = "name the lidar's own port, and no line rate behind it"
-
-
-class AbnormalState(DeviceFault):
-    """The sensor answers 0L: it accepts RB only."""
 
 
 class Session:
@@ -61,7 +60,8 @@ class Session:
         self.line = line
         self.baud = baud
         self.identity: Identity | None = None
-        self.health = ""
+        self.report = SelfReport()
+        self._t_report = -math.inf
 
     @property
     def device(self) -> str:
@@ -78,7 +78,8 @@ class Session:
         """Make the sensor idle in SCIP 2.x, from any state.
 
         Raises:
-            DeviceFault: no answer, an answer that is not SCIP, or no idle state. AbnormalState: it reports 0L.
+            DeviceFault: no answer, an answer that is not SCIP, or no idle state. NotReady: QT is refused for now.
+            AbnormalState: it reports 0L.
         """
         status = ""
         for _ in range(6):
@@ -90,10 +91,20 @@ class Session:
             if status == scip.ACCEPTED:
                 return
             if status == scip.ABNORMAL:
-                raise AbnormalState(self.device, "in its error state (0L)", _POWER_CYCLE)
-            if status in scip.DENIED:
+                raise AbnormalState(self.device, "in its error state (0L)", POWER_CYCLE)
+            if status in scip.NOT_NOW:
                 await self._try(scip.TM_LEAVE, _TEXT_S)
-        raise DeviceFault(self.device, f"does not become idle, QT answers {status or 'as SCIP 1.1'}", _POWER_CYCLE)
+        kind = NotReady if status in scip.NOT_NOW else DeviceFault
+        raise kind(self.device, f"does not become idle, QT answers {status or 'as SCIP 1.1'}", POWER_CYCLE)
+
+    async def leave_time_adjust(self) -> None:
+        """Leave the time-adjust mode, in which some firmware accepts QT and refuses every measurement.
+
+        Raises:
+            DeviceFault: as :meth:`settle`.
+        """
+        await self._try(scip.TM_LEAVE, _TEXT_S)
+        await self.settle()
 
     async def _quit(self) -> Reply:
         for _ in range(3):
@@ -151,7 +162,7 @@ class Session:
             if await self._try(command, _RESET_S) is not None:
                 break
         else:
-            raise DeviceFault(self.device, "does not answer a reset", _POWER_CYCLE)
+            raise DeviceFault(self.device, "does not answer a reset", POWER_CYCLE)
         await asyncio.sleep(_AFTER_RESET_S)
         if self.baud and command == scip.RS:  # RS resets the line rate as well
             await self.find_rate(scip.BAUD_RATES[0])
@@ -167,37 +178,70 @@ class Session:
     # identification
 
     async def identify(self) -> Identity:
-        """Query VV, PP and II.
+        """Query VV, PP and II. Only PP is needed to measure: a sensor that denies the others is identified without.
 
         Raises:
-            DeviceFault: no readable answer. DeviceRefused: a sensor that this driver does not support.
+            DeviceFault: PP is not readable. NotReady: PP is refused, or not answered although QT was.
+            DeviceRefused: a sensor that this driver does not support.
         """
-        vv = await self._text(scip.VV)
+        vv = await self._optional(scip.VV)
         pp = await self._text(scip.PP)
+        vv = vv or await self._optional(scip.VV)  # a sensor may have started meanwhile
         self.identity = identify(self.device, vv, pp)
-        with contextlib.suppress(DeviceFault, DataInvalid):  # diagnostics only; some firmware has no II
-            self.health = (await self._text(scip.II, tries=1)).get("STAT", "")
+        self.report = SelfReport.of(await self._optional(scip.II, tries=1))
         return self.identity
 
-    async def _text(self, command: bytes, tries: int = 4) -> dict[str, str]:
+    async def with_report(self, error: HalError) -> HalError:
+        """The error with what the sensor reports of itself in II (SCIP 2.2 answers it even in the error state)."""
+        if isinstance(error, (DataInvalid, DeviceMissing, DeviceRefused)):
+            return error
+        now = asyncio.get_running_loop().time()
+        if now - self._t_report >= _REPORT_S:
+            self._t_report = now
+            self.report = SelfReport.of(await self._ask(scip.II))
+        return self.report.added_to(error)
+
+    async def _ask(self, command: bytes) -> dict[str, str]:
+        """The text lines of one reply, as far as they are readable; empty without a reply."""
+        with contextlib.suppress(HalError):
+            reply = await self._try(command, _TEXT_S)
+            return parse_text(reply, strict=False) if reply is not None and reply.status == scip.ACCEPTED else {}
+        return {}
+
+    async def _optional(self, command: bytes, tries: int = 4) -> dict[str, str]:
+        """As :meth:`_text`; empty where the sensor gives no readable answer."""
+        try:
+            return await self._text(command, tries, silences=1)
+        except (AbnormalState, DeviceMissing):
+            raise
+        except HalError:
+            return {}
+
+    async def _text(self, command: bytes, tries: int = 4, silences: int = 2) -> dict[str, str]:
+        """The lines of a text reply, after up to ``tries`` queries of which ``silences`` may remain unanswered."""
         name = command[:2].decode()
         seen = b""
-        problem = "no answer"
+        problem = f"{name}: no answer, though QT is answered"
+        kind: type[DeviceFault] = NotReady
         for _ in range(tries):
             frame = await self._try_frame(command, _TEXT_S)
             if frame is None:
+                silences -= 1
+                if not silences:
+                    break
                 continue
             try:
                 reply = parse_reply(frame)
                 if reply.status == scip.ACCEPTED:
                     return parse_text(reply, strict=frame != seen)  # same bytes twice: the firmware sums differently
-                problem = f"answer {reply.status}"
-                if reply.status in scip.DENIED:  # some firmware accepts QT in time-adjust mode and stays there
+                problem = f"{name}: answer {reply.status}"
+                kind = NotReady if reply.status in scip.NOT_NOW else DeviceFault
+                if reply.status in scip.NOT_NOW:  # some firmware accepts QT in time-adjust mode and stays there
                     await self._try(scip.TM_LEAVE, _TEXT_S)
                 await self.settle()
             except BadFrame as error:
-                problem, seen = str(error), frame
-        raise DeviceFault(self.device, f"{name}: {problem}", _POWER_CYCLE)
+                problem, kind, seen = f"{name}: {error}", DeviceFault, frame
+        raise kind(self.device, problem, POWER_CYCLE)
 
     # streaming
 
@@ -260,7 +304,7 @@ class Session:
             streaming: returns whether scans have arrived, which proves success where the acknowledgement was lost.
 
         Raises:
-            DeviceFault, AbnormalState, DeviceRefused: by status.
+            DeviceFault, NotReady, AbnormalState, DeviceRefused: by status.
         """
         self.line.on_frame = on_frame
         for _ in range(3):
@@ -274,8 +318,8 @@ class Session:
 
     def _refusal(self, request: ScanRequest, reply: Reply | None) -> HalError:
         if reply is None:
-            return DeviceFault(self.device, f"does not acknowledge {request.name}", _POWER_CYCLE)
-        return explain_status(self.device, request.name, reply.status, self.health)
+            return DeviceFault(self.device, f"does not acknowledge {request.name}", POWER_CYCLE)
+        return explain_status(self.device, request.name, reply.status, self.report)
 
     async def quiet(self) -> None:
         """Switch the laser off within 0.1 s; errors of the device are ignored."""
@@ -306,19 +350,3 @@ class Session:
             return await result
         finally:
             self.line.set_on_lost(None)
-
-
-def explain_status(device: str, command: str, status: str, health: str = "") -> HalError:
-    """The error for a refusal or a mid-stream status (SCIP 2.0 section 5; 0L, 0M: SCIP 2.2)."""
-    text = f"{command} answers {status}" + (f", state: {health}" if health else "")
-    if status == scip.ABNORMAL:
-        return AbnormalState(device, f"{text}: error state", _POWER_CYCLE)
-    if status in scip.DENIED:
-        return DeviceFault(device, f"{text}: not now (booting, or in another mode)", "it is tried again")
-    if status.isdigit() and 50 <= int(status) <= 97:
-        return DeviceFault(device, f"{text}: hardware trouble (laser, motor)", f"{_POWER_CYCLE}; else have it repaired")
-    if status.isdigit() and 21 <= int(status) <= 49:
-        return DeviceFault(device, f"{text}: it is checking itself for a fault", _POWER_CYCLE)
-    if status in ("01", "02", "03", "04", "05", "06", "07"):
-        return DeviceRefused(device, f"{text}: it does not accept the range it states itself", "report the model")
-    return DeviceFault(device, text, _POWER_CYCLE)

@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from hal.hokuyo.models import Identity
 from hal.hokuyo.payload import Ints, ScanReply, ScanRequest, parse_scan
@@ -37,11 +38,6 @@ class ScanStream:
             geometry.period_s * turns, geometry.amax / geometry.ares / turns, request.frame_bytes / bytes_per_s
         )
         self._resets_seen = 0
-        self._dmax = identity.geometry.dmax
-        if identity.facts.no_return_from:
-            self._dmax = min(self._dmax, identity.facts.no_return_from - 1)
-        if request.form.chars == 2:
-            self._dmax = min(self._dmax, _SATURATED_2CHAR - 1)
 
     @property
     def stuck(self) -> bool:
@@ -75,23 +71,27 @@ class ScanStream:
 
     def _scan(self, data: ScanReply, when: ScanTime, t_rx: float, seq: int) -> RawScan:
         geometry, request = self.identity.geometry, self.request
-        valid = self._valid(data.distance)
+        distance = data.distance[: request.whole_groups]
+        valid = self._valid(distance)
         beam_dt_s = self._clock.period_s / (request.skip + 1) / geometry.ares
-        echoes = data.echoes
         return RawScan(
             geometry=geometry,
             seq=seq,
             t_rx=t_rx,
-            t_mono=when.t_mono + request.start * beam_dt_s,
+            t_mono=when.t_mono + (request.start + 0.5 * (request.stride - 1)) * beam_dt_s,
             t_sigma=when.t_sigma,
             t_tick=data.stamp,
             first_step=request.start,
             stride=request.stride,
-            ranges=np.where(valid, data.distance, np.int32(0)),
-            code=np.where(valid, np.int32(VALID), data.distance),
-            intensity=data.intensity,
-            echoes=None if echoes is None else np.where(self._valid(echoes), echoes, np.int32(0)),
+            ranges=np.where(valid, distance, np.int32(0)),
+            code=np.where(valid, np.int32(VALID), distance),
+            intensity=None if data.intensity is None else data.intensity[: request.whole_groups],
+            echoes=None if data.echoes is None else self._echoes(data.echoes[: request.whole_groups]),
         )
 
-    def _valid(self, distance: Ints) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        return (distance >= self.identity.geometry.dmin) & (distance <= self._dmax)
+    def _echoes(self, echoes: Ints) -> Ints:
+        return np.where(self._valid(echoes), echoes, np.int32(0))
+
+    def _valid(self, distance: Ints) -> npt.NDArray[np.bool_]:
+        valid = self.identity.is_distance(distance)
+        return valid & (distance < _SATURATED_2CHAR) if self.request.form.chars == 2 else valid

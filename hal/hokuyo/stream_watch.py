@@ -11,7 +11,8 @@ from hal.errors import DataInvalid, DeviceFault, HalError
 from hal.hokuyo import scip
 from hal.hokuyo.scip import BadFrame, Reply, parse_reply
 from hal.hokuyo.scip_line import Line
-from hal.hokuyo.session import FIRST_SCAN_S, explain_status
+from hal.hokuyo.sensor_errors import explain_status
+from hal.hokuyo.session import FIRST_SCAN_S
 from hal.hokuyo.stream import ScanStream
 from hal.lidar import LidarStatus, RawScan
 
@@ -42,6 +43,7 @@ class StreamWatch:
         self._deadline = clock.now() + FIRST_SCAN_S
         self._dropped = line.dropped_bytes
         self._damaged = ""
+        self._unready = ""
         self.scans = 0
 
     @property
@@ -98,7 +100,9 @@ class StreamWatch:
 
     def _receive_notice(self, reply: Reply) -> None:
         """Process a status inside the stream: acknowledgement, self-check, error."""
-        if reply.status in (scip.ACCEPTED, scip.RESUMED, "0B", "0M"):
+        if reply.status == scip.UNSTABLE:
+            self._unready = reply.status
+        if reply.status in (scip.ACCEPTED, scip.RESUMED, "0B", scip.UNSTABLE):
             return
         if reply.status.isdigit() and 21 <= int(reply.status) <= 49:
             self._deadline = max(self._deadline, self._clock.now() + _SELF_CHECK_S)
@@ -125,6 +129,8 @@ class StreamWatch:
             return DataInvalid(name, "only unreadable bytes come", "check its cable and, on RS-232, the line rate")
         if self._damaged:
             return DataInvalid(name, f"only damaged frames come ({self._damaged})", _WATCH_CABLE)
+        if self._unready and not self.scans:
+            return explain_status(name, "stream", self._unready)
         what = "has fallen silent" if self.scans else f"sends no scan within {FIRST_SCAN_S:g} s"
         return DeviceFault(name, what, _WATCH_CABLE)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import ipaddress
 import socket
 from functools import partial
 from typing import Any, Final
@@ -20,6 +21,11 @@ def scope(address: Address) -> int:
     """Number of the network interface that an address names, 0: none."""
     where = address[1]
     return where[3] if len(where) == 4 else 0
+
+
+def is_group(address: Address) -> bool:
+    """Whether an address is a multicast group."""
+    return ipaddress.ip_address(address[1][0].partition("%")[0]).is_multicast
 
 
 def with_port(address: Address, port: int) -> Address:

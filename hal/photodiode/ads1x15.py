@@ -24,6 +24,10 @@ RATES: Final = {
 }
 """Samples per second by DR code."""
 _IDLE: Final = 0x8000
+_RESET: Final = 0x8583
+_MARK: Final = 0b10111
+"""Low bits of our configurations: comparator off (00011). The others (window, latch) then have no effect: other
+programs leave them at 0, so that a configuration of theirs differs from ours even with the same input."""
 
 
 class Register(IntEnum):
@@ -42,7 +46,7 @@ READ_BACK: Final = Query(bytes([Register.CONFIGURATION]), 2)
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """The configuration register, comparator off.
+    """The configuration register, comparator off and marked as ours.
 
     Attributes:
         channel: AIN0 to AIN3 against ground. pga: index into :data:`RANGES_V`. rate: DR code.
@@ -62,7 +66,7 @@ class Configuration:
             if not 0 <= value < count:
                 raise ValueError(f"{name} {value}: expected 0 to {count - 1}")
         fields = (self.start << 15) | ((4 + self.channel) << 12) | (self.pga << 9)
-        return fields | (self.single << 8) | (self.rate << 5) | 0b00011
+        return fields | (self.single << 8) | (self.rate << 5) | _MARK
 
     def message(self) -> bytes:
         """The bytes of the write: pointer and word."""
@@ -72,6 +76,11 @@ class Configuration:
     def full_scale_v(self) -> float:
         """Voltage at which the result saturates."""
         return RANGES_V[min(self.pga, 5)]
+
+
+def after_reset(answer: bytes) -> bool:
+    """Whether a configuration is the one after a reset of the chip; bit 15 as in :func:`same_configuration`."""
+    return len(answer) == 2 and (int.from_bytes(answer, "big") ^ _RESET) & ~_IDLE == 0
 
 
 def same_configuration(answer: bytes, wanted: Configuration) -> bool:

@@ -97,9 +97,10 @@ class BlockDiagnosis:
         if defects.floated:
             problem, remedy = "every bit reads 1: the bus floats", "check the converter's power, its ground, and SDA"
             return DeviceFault(self._device, f"{self._where}: {problem}", remedy)
+        what = "words without their highest bits" if defects.lost_bits else "words with bits it keeps at zero"
         return DataInvalid(
             self._device,
-            f"{self._where}: words with bits it keeps at zero",
+            f"{self._where}: {what}",
             "another kind of chip, or bits lost on the bus: check chip, address, wiring and pull-ups",
         )
 

@@ -24,7 +24,7 @@ from hal.lidar import Link
 from hal.photodiode.adapter_limits import AdapterLimits, measure
 from hal.photodiode.bus_watchdog import HANG_S, WatchedBus
 from hal.photodiode.chips import BlockChip, chip_named
-from hal.photodiode.dc_channel import PERIOD_S, LevelInput, LevelMeter, read_register
+from hal.photodiode.dc_channel import FOREIGN, PERIOD_S, LevelInput, LevelMeter, read_register
 from hal.photodiode.diagnosis import BlockDiagnosis
 from hal.photodiode.io_errors import explain, policy_for
 from hal.photodiode.sampler import Sampler, describe
@@ -217,7 +217,9 @@ class PhotodiodeAdc:
         while True:
             await meter.update(bus)
             level = meter.level()
-            self._status.extra["dc_level"] = meter.problem if level is None else f"{100 * level:.1f} %"
+            shown = meter.problem if level is None else f"{100 * level:.1f} %"
+            shared = level is not None and meter.shared
+            self._status.extra["dc_level"] = f"{shown} ({FOREIGN})" if shared else shown
             await asyncio.sleep(PERIOD_S)
 
     def _level(self) -> float | None:

@@ -71,8 +71,8 @@ POLICIES: Final[dict[int, Policy]] = {
     ),
     errno.EBUSY: Policy(
         DeviceRefused,
-        "address {address} is in use by another program, or by a kernel driver",
-        "end the other program (fuser -v /dev/i2c-N), or unbind the driver (device-tree overlay)",
+        "address {address} is in use by another lumiloop or program, or by a kernel driver",
+        "end the other one (fuser -v /dev/i2c-N; systemctl status lumiloop), or unbind the driver",
         retries=3,  # `lumiloop probe` holds an address for some 10 ms
         pause_s=0.05,
     ),

@@ -11,12 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from hal.errors import DataInvalid
+from hal.replay.monotone_stamps import monotone
 from hal.replay.report import LogReport
 from hal.replay.text import unreadable
 
 _HEAD: Final = struct.Struct(">QI")
 _LONGEST: Final = 1 << 20
+_FEW: Final = 5
+"""Chunks that may have come in one instant."""
 _LATEST_US: Final = 1 << 53  # 285 years: a later time is text, not a time
 
 
@@ -43,7 +48,7 @@ def read_capture(path: Path, report: LogReport) -> list[Chunk]:
 
     Raises:
         DeviceMissing, DeviceRefused: no such file, or no permission to read it.
-        DataInvalid: empty, or not a capture.
+        DataInvalid: empty, not a capture, or without usable time.
     """
     try:
         data = path.read_bytes()
@@ -55,9 +60,26 @@ def read_capture(path: Path, report: LogReport) -> list[Chunk]:
     chunks = list(_chunks(data, report))
     if not chunks:
         raise DataInvalid(str(path), "ends within its first record", "name another log; nothing can be played of it")
+    chunks = _in_time(path, chunks, report)
     report.use("chunks", len(chunks))
     report.use("bytes", sum(len(chunk.data) for chunk in chunks))
     return chunks
+
+
+def _in_time(path: Path, chunks: list[Chunk], report: LogReport) -> list[Chunk]:
+    """The chunks with times that increase, where the host's clock was set or is coarse.
+
+    Raises:
+        DataInvalid: all times are equal.
+    """
+    stamps = 1e-6 * np.array([chunk.t_us for chunk in chunks])
+    clock = monotone(stamps, 0.0)
+    if len(chunks) > _FEW and clock.duplicates == len(chunks) - 1:
+        raise DataInvalid(str(path), f"all {len(chunks)} times in it are equal", "capture the line with its times")
+    if not (clock.backward or clock.restarts or clock.wild or clock.coarse_s):
+        return chunks
+    report.notes.append("the host's clock was set, or is coarse: its steps are bridged or spread")
+    return [Chunk(round(1e6 * t), chunk.data) for t, chunk in zip(clock.time.tolist(), chunks, strict=True)]
 
 
 def _chunks(data: bytes, report: LogReport) -> Iterator[Chunk]:

@@ -31,6 +31,7 @@ Array = npt.NDArray[np.float64]
 
 _GIVE_UP_LINES: Final = 1000
 _NO_ODOMETRY: Final = (np.empty(0), np.empty((0, 3)))
+_NO_TIME: Final = "name a log with the time of every scan in seconds, as the logger wrote it (UNIX time)"
 _REMEDY: Final = "name a log with laser lines, or make one with `lumiloop convert IN OUT`"
 
 
@@ -39,7 +40,8 @@ class CarmenLog:
     """A log in memory.
 
     Attributes:
-        stamps: original stamp of every scan in file order, seconds. time: their monotone time (first near 0).
+        stamps: original stamp of every scan in file order, seconds; spread where the log's clock is coarse. time: their
+            monotone time (first near 0).
         mount: (x, y, yaw) of the laser on the robot, m and rad. report: skipped lines and assumptions.
     """
 
@@ -112,7 +114,7 @@ def read_carmen(path: Path) -> CarmenLog:
 
     Raises:
         DeviceMissing, DeviceRefused: no such file, or no permission to read it.
-        DataInvalid: no scan in it; names file, line and remedy.
+        DataInvalid: no scan in it, or stamps without usable time; names file, line and remedy.
     """
     report = LogReport()
     parsed = _parse_all(path, report)
@@ -123,11 +125,13 @@ def read_carmen(path: Path) -> CarmenLog:
     stamps = np.array([line.stamp for line in lasers])
     origin = float(stamps[0])
     clock = monotone(stamps, origin)
+    if clock.refusal:
+        raise DataInvalid(str(path), f"its stamps give no time to play it at: {clock.refusal}", _NO_TIME)
     _note_stamps(clock, report)
-    separate = _separate_odometry(parsed.odometry, origin)
+    separate = _separate_odometry(parsed.odometry, origin, report)
     return CarmenLog(
         path=path,
-        stamps=stamps,
+        stamps=origin + clock.time if clock.coarse_s else stamps,
         time=clock.time,
         mount=log_mount(lasers, parsed.parameters, report),
         parameters=parsed.parameters,
@@ -229,17 +233,27 @@ def _note_stamps(clock: Monotone, report: LogReport) -> None:
         report.notes.append(
             f"stamps run backwards {clock.backward} times, by {clock.worst_s:.3f} s at most: file order is kept"
         )
-    if clock.duplicates:
+    if clock.wild:
+        report.notes.append(f"{clock.wild} single stamps are far from both neighbours: taken from these")
+    if clock.coarse_s:
+        report.notes.append(
+            f"the log's clock steps by {clock.coarse_s:.3g} s, and {clock.duplicates} stamps equal the one before: "
+            "spread evenly over each step"
+        )
+    elif clock.duplicates:
         report.notes.append(f"{clock.duplicates} stamps equal the one before: spread in time")
     if clock.restarts:
         report.notes.append(f"the log's clock restarted or was set {clock.restarts} times: bridged")
 
 
-def _separate_odometry(readings: list[OdometryLine], origin: float) -> tuple[Array, Array]:
+def _separate_odometry(readings: list[OdometryLine], origin: float, report: LogReport) -> tuple[Array, Array]:
     """Time and poses of the ODOM lines."""
     if not readings:
         return _NO_ODOMETRY
     clock = monotone(np.array([reading.stamp for reading in readings]), origin)
+    if len(readings) > 1 and clock.duplicates == len(readings) - 1:
+        report.notes.append("all ODOM lines have one stamp: not used")
+        return _NO_ODOMETRY
     return clock.time, np.array([reading.pose for reading in readings])
 
 

@@ -57,7 +57,9 @@ def _row(label: str, member: Member, now: float) -> tuple[str, ...]:
     survey = None if state is None else state.held.get("survey")
     legend = "GONE" if not member.publishers else "?" if state is None else state.state_name
     faults = () if state is None else state.faults
-    words = "; ".join(f"{one.fault} {one.meaning}" for one in faults) or ("" if state is None else state.meaning)
+    words = "; ".join(f"{one.fault} {one.meaning}" for one in faults if not one.cause) or (
+        "" if state is None else state.meaning
+    )
     return (
         label,
         member.name,

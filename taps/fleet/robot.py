@@ -29,7 +29,7 @@ from taps.fleet import messages
 from taps.fleet.claim import Claim
 from taps.fleet.messages import MapHead, PoseMessage, StateMessage
 from taps.fleet.placing import Records
-from taps.metrics.vda5050 import position_v2
+from taps.metrics.vda5050 import localised, position_v2
 from taps.stream.tiles import TileMap, trinary
 from taps.zenoh_session import BadEndpoint, open_session, undeclare, watch_router
 
@@ -132,7 +132,7 @@ class Robot:
         self._faults: Faults | None = None
         self._tiles = TileMap()
         self._t_pose = self._stated = self._drawn = -math.inf
-        self._seq = -1
+        self._published: Pose | None = None
         self._lost = False
         self._last_state: StateMessage | None = None
         self._name: tuple[int, str] = 0, ""
@@ -162,12 +162,12 @@ class Robot:
         now = time.monotonic()
         hangs = now - self._t_pose > OLD_S
         if (pose := self._pose) is not None and not hangs:
-            if pose.seq != self._seq:
-                self._seq, self._lost = pose.seq, False
+            self._lost = False
+            if self._is_new(pose):
                 self._publish_pose(pose)
         elif (held := self._held) is not None and not self._lost:
             # late subscribers receive the last message: it must not claim a valid pose
-            self._seq, self._lost = -1, True
+            self._lost = True
             self._publish_pose(msgspec.structs.replace(held, pose=None, covariance=None, velocity=None))
         state = self._state(hangs)
         since = now - self._stated
@@ -182,7 +182,13 @@ class Robot:
             self._drawn = now
             self._draw()
 
+    def _is_new(self, pose: Pose) -> bool:
+        """Whether a snapshot has a pose of a later instant than the one published, or its validity has changed."""
+        before = self._published
+        return before is None or pose.t_mono > before.t_mono or localised(pose) != localised(before)
+
     def _publish_pose(self, pose: Pose) -> None:
+        self._published = pose
         message = PoseMessage(
             seq=pose.seq,
             t_utc=pose.utc(pose.t_mono),

@@ -1,6 +1,7 @@
 """`lumiloop foxglove`: a WebSocket server of the running daemon for the Foxglove app (ws://ADDRESS:8765).
 
-The messages are those of the MCAP files. Static data (map, mount, state) are repeated to a new subscriber.
+The messages are those of the MCAP files. Clients connect through `taps.foxglove.gate`. Static data (map, mount, state)
+are repeated to a new subscriber.
 """
 
 from __future__ import annotations
@@ -8,7 +9,8 @@ from __future__ import annotations
 import argparse
 import asyncio
 import threading
-from typing import Final
+from collections.abc import Coroutine, Sequence
+from typing import Any, Final
 
 import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
@@ -18,6 +20,8 @@ from daemon.publish.stream.client import Stream
 from daemon.publish.stream.messages import NotTheStream
 from daemon.system import console
 from hal.run_server import run_until_stopped
+from taps.access_guard import Guard
+from taps.foxglove.gate import LONGEST_HEAD, Gate, random_loopback
 from taps.ros import types
 from taps.ros.messages import TOPICS, RosMessage
 from taps.ros.stream_follower import forward
@@ -29,20 +33,42 @@ def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     try:
         host, port = parse_endpoint(args.listen)
-        bridge = Bridge(host, port, args.settings.name)
     except ValueError as error:
         return console.fail(f"--listen: {error}", console.USAGE)
-    except (OSError, RuntimeError) as error:
-        return console.fail(f"cannot listen on {args.listen}: {error}; free it, or name another with --listen")
-    console.say(f"ws://{in_url(host)}:{bridge.port}")
+    bridge = Bridge(random_loopback(), 0, args.settings.name)
+    stream = Stream(args.stream or args.settings.name, WANTED)
     try:
-        stream = Stream(args.stream or args.settings.name, WANTED)
-        asyncio.run(run_until_stopped(forward(stream, args.settings, bridge)))
+        asyncio.run(serve(bridge, (host, port), args.origin, forward(stream, args.settings, bridge)))
     except NotTheStream as error:
         return console.fail(str(error))
+    except OSError as error:
+        why = error.strerror or error
+        return console.fail(f"cannot listen on {args.listen}: {why}; free it, or name another with --listen")
     finally:
         bridge.close()
     return console.OK
+
+
+async def serve(
+    bridge: Bridge, listen: tuple[str, int], origins: Sequence[str], forwarding: Coroutine[Any, Any, None]
+) -> None:
+    """Accept clients on an address, and send them messages until stopped.
+
+    Raises:
+        OSError: the address cannot be used. NotTheStream: by ``forwarding``.
+    """
+    gate = Gate(Guard(bind=listen[0]), origins, (bridge.host, bridge.port))
+    try:
+        server = await asyncio.start_server(gate, *listen, limit=LONGEST_HEAD)
+    except OSError:
+        forwarding.close()
+        raise
+    console.say(f"ws://{in_url(listen[0])}:{server.sockets[0].getsockname()[1]}")
+    try:
+        await run_until_stopped(forwarding)
+    finally:
+        server.close()
+        await gate.close()
 
 
 class Bridge(ServerListener):
@@ -50,6 +76,7 @@ class Bridge(ServerListener):
 
     def __init__(self, host: str, port: int, name: str) -> None:
         """Begin to serve; raises OSError or RuntimeError where the address cannot be used."""
+        self.host = host
         self._context = foxglove.Context()
         self._latest: dict[str, RosMessage] = {}
         self._repeat: set[str] = set()

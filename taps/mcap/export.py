@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.replay.recorded_inputs import Given
-from daemon.replay.results import OutputRefused, kitti, tum
+from daemon.replay.results import OutputRefused, doubt, kitti, tum
 from daemon.runtime import warmup
 from daemon.system import console
 from daemon.system.atomic_file import write_whole
@@ -35,7 +35,6 @@ GROWTH: Final = 1.25
 FIRST_MAP: Final = 5
 IN_A_LOG_S: Final = 10.0
 """Period of progress lines where standard error is no terminal."""
-MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 
 
 class OutputConflict(Exception):
@@ -44,11 +43,9 @@ class OutputConflict(Exception):
 
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
-    if args.mcap is None and args.tum is None and args.kitti is None:
-        return console.fail("say what to write: --mcap FILE, --tum FILE, --kitti FILE", console.USAGE)
     try:
         with _stoppable():
-            return _save(args) if _is_mcap(args.log) else _export(args)
+            return _save(args) if args.source is None else _export(args)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("daemon", "estimator", "hal", "taps"):
             raise
@@ -59,13 +56,6 @@ def main(args: argparse.Namespace) -> int:
         return console.fail(str(error))
     except OSError as error:
         return console.fail(f"{error.filename or args.log}: {error.strerror}; free space or name another file")
-
-
-def _is_mcap(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
 
 
 def _save(args: argparse.Namespace) -> int:
@@ -86,7 +76,7 @@ def _save(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     keys = tuple(override.partition("=")[0].strip() for override in args.set)
-    source = RecordingSource(args.log, args.settings, Given(args.config is not None, keys))
+    source = RecordingSource(args.source, args.settings, Given(args.config is not None, keys))
     _check_outputs(source.source.files, args)
     if made := made_elsewhere(source.source.header):
         console.say(f"{args.log}: {made}")
@@ -102,7 +92,7 @@ def _export(args: argparse.Namespace) -> int:
             stopped = _run(source, translator, file)
             _draw(source, translator, file)
         console.say(f"{args.mcap}: {file.messages} messages")
-    final = source.rerun.ledger.online() if args.online else source.rerun.ledger.final()
+    final = (source.rerun.ledger.online() if args.online else source.rerun.ledger.final()).ordered()
     guesses = sum(map(bool, final.guesses()))
     guessed = f", and {guesses} guesses that are none" if guesses else ""
     for path, text in ((args.tum, tum), (args.kitti, kitti)):
@@ -117,6 +107,8 @@ def _export(args: argparse.Namespace) -> int:
         console.say(
             f"the replay is not the recorded run in {count} cycles: other software, or records lost; first {first}"
         )
+    if sentence := doubt(source.rerun.ledger.online()):
+        console.say(f"{args.log}: {sentence}")
     return console.fail(f"{stopped}; what was read until then is written") if stopped else console.OK
 
 

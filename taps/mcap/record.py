@@ -69,7 +69,7 @@ async def record(stream: Stream, settings: Config, file: McapFile) -> None:
         OSError: the file cannot be written.
         NoRoom: its disk has no room beyond the reserve.
     """
-    translator = Translator(settings.lidar.mount)
+    translator = Translator(settings.lidar.mount, ordered=True)
     flushing = asyncio.ensure_future(_flush(file))
     try:
         async with contextlib.aclosing(stream.frames()) as frames:
@@ -78,7 +78,7 @@ async def record(stream: Stream, settings: Config, file: McapFile) -> None:
                     console.say(f"{frame.text}; waiting")
                 elif isinstance(frame, Hello):
                     console.say(f"recording {frame.name} into {file.path}")
-                    translator = Translator(settings.lidar.mount)
+                    translator.restart()
                 else:
                     for out in translator.convert(frame):
                         file.write(out)

@@ -136,14 +136,14 @@ def _of_pose(pose: Pose, now: float) -> Iterator[tuple[str, str, str, Iterable[S
     if pose.pulse is not None:
         yield "lumiloop_rung", "gauge", "what is left out for lack of time", [({}, float(pose.pulse.rung))]
         yield "lumiloop_stalls_total", "counter", "times no cycle began in time", [({}, float(pose.pulse.stalls))]
-        yield "lumiloop_cycle_seconds", "gauge", "computing time of recent cycles", _spread(pose.pulse.cycle)
-        yield "lumiloop_late_seconds", "gauge", "how late recent cycles began", _spread(pose.pulse.late)
+        yield "lumiloop_cycle_seconds", "summary", "computing time of recent cycles", _spread(pose.pulse.cycle)
+        yield "lumiloop_late_seconds", "summary", "how late recent cycles began", _spread(pose.pulse.late)
         stages = [
             ({"stage": stage.name.lower(), **labels}, value)
             for stage, spread in zip(Stage, pose.pulse.stages, strict=False)
             for labels, value in _spread(spread)
         ]
-        yield "lumiloop_stage_seconds", "gauge", "computing time of each stage", stages
+        yield "lumiloop_stage_seconds", "summary", "computing time of each stage", stages
     if pose.condition is not None:
         restarts = [
             ({"part": part.name.lower()}, float(n)) for part, n in zip(Part, pose.condition.restarts, strict=False)
@@ -179,7 +179,10 @@ def _spread(spread: tuple[int, int, int] | None) -> list[Sample]:
 
 
 def _family(name: str, kind: str, what: str, samples: Iterable[Sample]) -> str:
-    lines = [f"{name}{_labels(labels)} {_number(value)}\n" for labels, value in samples]
+    series: dict[str, float] = {}  # Prometheus refuses a page that has a series twice: the first one stays
+    for labels, value in samples:
+        series.setdefault(_labels(labels), value)
+    lines = [f"{name}{labels} {_number(value)}\n" for labels, value in series.items()]
     return f"# HELP {name} {what}\n# TYPE {name} {kind}\n{''.join(lines)}" if lines else ""
 
 

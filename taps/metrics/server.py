@@ -9,6 +9,7 @@ import argparse
 import asyncio
 import contextlib
 import json
+import logging
 import time
 from typing import Final
 
@@ -16,10 +17,15 @@ from daemon.config.endpoints import in_url, parse_endpoint
 from daemon.publish.stream.client import Stream
 from daemon.publish.stream.messages import NotTheStream
 from daemon.system import console
+from daemon.system.defects import Place, log_once
+from daemon.system.logging import start_command_log
+from hal.net.peers import full_for
 from hal.run_server import run_until_stopped
 from taps.access_guard import Guard
 from taps.metrics import vda5050
 from taps.metrics.metrics import CONTENT_TYPE, Latest, exposition
+
+log = logging.getLogger(__name__)
 
 LONGEST_REQUEST: Final = 8192
 PATIENCE_S: Final = 5.0
@@ -39,6 +45,7 @@ INDEX: Final = "/metrics: Prometheus\n/vda5050: position, version 3\n/vda5050/2:
 
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
+    start_command_log()
     try:
         host, port = parse_endpoint(args.listen)
         stream = Stream(args.stream or args.settings.name, TOPICS)
@@ -75,21 +82,26 @@ class HttpHandler:
 
     def __init__(self, messages: Latest, guard: Guard) -> None:
         self._messages, self._guard = messages, guard
-        self._clients = 0
+        self._peers: list[str] = []
+        self._defects: set[Place] = set()
 
     async def __call__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve one request; a slow client, and one above the limit, is disconnected."""
-        self._clients += 1
+        """Serve one request; a slow client, and one above the limit or its host's share, is disconnected."""
+        peer = str((writer.get_extra_info("peername") or ("",))[0])
+        refused = len(self._peers) >= CLIENTS or full_for(peer, self._peers, CLIENTS)
+        self._peers.append(peer)
         try:
-            if self._clients <= CLIENTS:
+            if not refused:
                 async with asyncio.timeout(PATIENCE_S):
                     request = await reader.readuntil(b"\r\n\r\n")
                     writer.write(self._answer(request))
                     await writer.drain()
         except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
             return
+        except Exception as error:  # noqa: BLE001  any failure ends this connection alone
+            log_once(log, self._defects, error, "a request cannot be answered; its connection is closed")
         finally:
-            self._clients -= 1
+            self._peers.remove(peer)
             writer.close()
 
     def _answer(self, request: bytes) -> bytes:

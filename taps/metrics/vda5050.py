@@ -14,6 +14,11 @@ from daemon.snapshot import State
 LOCALISED = (State.TRACKING, State.MAPPING, State.DEGRADED)
 
 
+def localised(latest: Pose) -> bool:
+    """Whether the snapshot has a confirmed pose."""
+    return latest.pose is not None and latest.covariance is not None and latest.state in LOCALISED
+
+
 def position(latest: Pose, held: Pose | None = None) -> dict[str, object] | None:
     """The object of version 3; None before the first pose.
 
@@ -23,17 +28,17 @@ def position(latest: Pose, held: Pose | None = None) -> dict[str, object] | None
     known = latest if latest.pose is not None else held
     if known is None or known.pose is None:
         return None
-    localised = latest.pose is not None and latest.covariance is not None and latest.state in LOCALISED
+    confirmed = localised(latest)
     x, y, yaw = known.pose
     position_object: dict[str, object] = {
         "x": round(x, 4),
         "y": round(y, 4),
         "theta": round(math.remainder(yaw, 2.0 * math.pi), 5),
         "mapId": f"{known.map_id:08x}",
-        "localized": localised,
-        "localizationScore": round(sum(latest.known) / len(latest.known), 2) if localised else 0.0,
+        "localized": confirmed,
+        "localizationScore": round(sum(latest.known) / len(latest.known), 2) if confirmed else 0.0,
     }
-    if localised and latest.trust.horizontal_m is not None:
+    if confirmed and latest.trust.horizontal_m is not None:
         position_object["deviationRange"] = round(latest.trust.horizontal_m, 4)
     return position_object
 

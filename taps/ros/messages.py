@@ -1,7 +1,8 @@
 """Converts stream messages to ROS 2 messages, for files, live servers and replayed recordings.
 
 Coordinate frames after REP-103 and REP-105: ``map`` > ``odom`` > ``base_link`` > ``laser``. The pose in the map may
-jump, the one in ``odom`` does not.
+jump, the one in ``odom`` does not. Stamps of poses ascend strictly: a snapshot without a new measurement has no pose of
+its own, and a correction of the same instant appears with the next measurement.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from daemon.config.schema import Mount
 from daemon.publish.stream.messages import (
+    Fault,
     Faults,
     Frame,
     Lights,
@@ -34,7 +36,7 @@ from taps.stream.tiles import TileMap, trinary
 MAP, ODOM, BASE, LASER = "map", "odom", "base_link", "laser"
 
 STEP_S: Final = 0.5
-"""A smaller correction of the computer's UTC does not change the stamps."""
+"""A smaller correction of the computer's UTC does not change the stamps, s."""
 REPEAT_S: Final = 5.0
 """Period at which static data are repeated, for late subscribers."""
 SLOWEST_HZ: Final = 1.0
@@ -90,12 +92,22 @@ class Translator:
 
     Args:
         mount: of the lidar. utc: maps ``t_mono`` to UTC (s); None: from the poses, with no message before the first.
+        ordered: never step back with the computer's UTC, as for a file.
     """
 
-    def __init__(self, mount: Mount, utc: Callable[[float], float] | None = None) -> None:
+    def __init__(self, mount: Mount, utc: Callable[[float], float] | None = None, ordered: bool = False) -> None:
         self._mount = mount
         self._utc = utc
+        self._ordered = ordered
         self._offset: float | None = None
+        self._place_ns = self._light_ns = -1
+        self._reset()
+
+    def restart(self) -> None:
+        """Begin with another run of the daemon: drop its data, keep the clock and the order of stamps."""
+        self._reset()
+
+    def _reset(self) -> None:
         self._static = self._diagnosed = -math.inf
         self._state: tuple[int, int] | None = None
         self._faults: Faults | None = None
@@ -156,14 +168,32 @@ class Translator:
         return RosMessage(topic, ros.nanoseconds(t), ros.encode(kind, ros.make(kind, **fields)))
 
     def _pose(self, frame: Pose) -> Iterator[RosMessage]:
-        offset = frame.utc(0.0)
-        if self._offset is None or abs(offset - self._offset) > STEP_S:
-            self._offset = offset
+        self._set_clock(frame.utc(0.0))
         t = self._at(frame.t_mono)
         assert t is not None
         self._now = frame.t_mono
         yield from self._static_transforms(t)
         yield from self._map()
+        if (frame.odom or frame.pose) is not None and ros.nanoseconds(t) > self._place_ns:
+            self._place_ns = ros.nanoseconds(t)
+            yield from self._places(t, frame)
+        if (frame.state, frame.reason) != self._state:
+            self._state, self._diagnosed = (frame.state, frame.reason), -math.inf
+            yield self._changed(t, frame)
+        if frame.t_mono - self._diagnosed >= 1.0 / SLOWEST_HZ:
+            self._diagnosed = frame.t_mono
+            yield self._out("/diagnostics", t, header=ros.header(t, ""), status=self._statuses(frame))
+
+    def _set_clock(self, offset: float) -> None:
+        """Follow the computer's UTC, which is ``offset`` + ``t_mono`` (s), where it has been stepped."""
+        step = math.inf if self._offset is None else offset - self._offset
+        if step > STEP_S or (step < -STEP_S and not self._ordered):
+            self._offset = offset
+            if step < 0.0:
+                self._place_ns = self._light_ns = -1
+
+    def _places(self, t: float, frame: Pose) -> Iterator[RosMessage]:
+        """The poses of an instant in each frame."""
         if frame.odom is not None:
             yield self._odom(t, frame, frame.odom)
             moving = [ros.transform(t, ODOM, BASE, frame.odom)]
@@ -177,12 +207,6 @@ class Translator:
                 covariance=ros.planar(frame.covariance),
             )
             yield self._out("/pose", t, header=ros.header(t, MAP), pose=place)
-        if (frame.state, frame.reason) != self._state:
-            self._state, self._diagnosed = (frame.state, frame.reason), -math.inf
-            yield self._changed(t, frame)
-        if frame.t_mono - self._diagnosed >= 1.0 / SLOWEST_HZ:
-            self._diagnosed = frame.t_mono
-            yield self._out("/diagnostics", t, header=ros.header(t, ""), status=self._statuses(frame))
 
     def _static_transforms(self, t: float) -> Iterator[RosMessage]:
         if not 0.0 <= self._now - self._static < REPEAT_S:
@@ -242,11 +266,11 @@ class Translator:
         )
 
     def _lights_message(self, frame: Lights) -> Iterator[RosMessage]:
-        known = frame.t_mono is not None and (self._lights is None or frame.t_mono != self._lights.t_mono)
         self._lights = frame
         t = None if frame.t_mono is None else self._at(frame.t_mono)
-        if not known or t is None:
+        if t is None or ros.nanoseconds(t) <= self._light_ns:
             return
+        self._light_ns = ros.nanoseconds(t)
         x, y, yaw = frame.pose or (math.nan,) * 3
         links = [
             ros.make(
@@ -312,7 +336,7 @@ class Translator:
         text = f"{frame.state_name}: {frame.meaning}" if frame.meaning else frame.state_name
         found = [_status(level, "state", text, {"remedy": frame.remedy, "jumps": frame.jumps, "map": frame.map_id})]
         present = () if self._faults is None else self._faults.present
-        found += [_status(ERROR, f"fault {one.fault}", one.meaning, {"remedy": one.remedy}) for one in present]
+        found += [_of_fault(one) for one in present]
         pulse = frame.pulse
         if pulse is not None:
             late = {"rung": pulse.rung, "stalls": pulse.stalls, "overruns": frame.overruns, "cycle_us": frame.cycle_us}
@@ -324,6 +348,12 @@ class Translator:
             lights = {"in view": len(self._lights.links), "blocks": self._lights.blocks}
             found.append(_status(OK, "lights", f"{self._lights.used} used", lights))
         return found
+
+
+def _of_fault(fault: Fault) -> Any:
+    """A fault; one that follows from another is a warning, because its cause is the error."""
+    values = {"remedy": fault.remedy} | ({"cause": fault.cause} if fault.cause else {})
+    return _status(WARN if fault.cause else ERROR, f"fault {fault.fault}", fault.meaning, values)
 
 
 def _status(level: int, name: str, message: str, values: dict[str, Any]) -> Any:

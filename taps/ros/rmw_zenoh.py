@@ -6,11 +6,12 @@ the liveliness tokens. The payload is CDR (`taps.ros.types`).
 
 from __future__ import annotations
 
-import hashlib
 import re
 import struct
 from dataclasses import dataclass
 from typing import Final
+
+from taps.ros.xxh3 import xxh3_128
 
 ADMIN: Final = "@ros2_lv"
 UNSUPPORTED: Final = "TypeHashNotSupported"
@@ -92,8 +93,11 @@ def attachment(number: int, t_ns: int, gid: bytes) -> bytes:
 
 
 def gid_of(token: str) -> bytes:
-    """Unique 16-byte ID of a publisher. rmw_zenoh uses XXH3 of the token; the two are never compared."""
-    return hashlib.blake2b(token.encode(), digest_size=_GID).digest()
+    """GID of the entity with this liveliness token, 16 bytes: XXH3 of the token, both halves little-endian.
+
+    A subscriber of rmw_zenoh computes it from the token that it sees, and finds it in each message's attachment.
+    """
+    return xxh3_128(token.encode()).to_bytes(_GID, "little")
 
 
 def _mangled(name: str) -> str:

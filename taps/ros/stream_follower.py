@@ -31,7 +31,7 @@ async def forward(stream: Stream, settings: Config, sender: Sender) -> None:
             if isinstance(frame, Lost):
                 console.say(f"{frame.text}; waiting")
             elif isinstance(frame, Hello):
-                translator = Translator(settings.lidar.mount)
+                translator.restart()
             else:
                 for out in translator.convert(frame):
                     sender.send(out)

@@ -14,7 +14,7 @@ from daemon.publish.stream.server import Client, StreamServer
 from daemon.publish.stream.ticker import BEAT_S, in_words
 from daemon.replay.recorded_inputs import NOTHING_GIVEN, Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
-from daemon.replay.sources import Source, open_log
+from daemon.replay.sources import Source
 from hal.adc import RawSamples
 from hal.lidar import RawScan
 from hal.replay.recording import Kind, open_recording
@@ -44,11 +44,11 @@ class RecordingSource:
         source, config, rerun: as `daemon.cli.replay` has them.
 
     Raises:
-        HalError: the log, its configuration or its survey cannot be used.
+        HalError: its configuration, survey or map cannot be used.
     """
 
-    def __init__(self, path: Path, config: Config, given: Given = NOTHING_GIVEN) -> None:
-        self.source: Source = open_log(path)
+    def __init__(self, source: Source, config: Config, given: Given = NOTHING_GIVEN) -> None:
+        self.source = source
         self.config = config_for(self.source, config, given)
         lights = lights_for(self.source, self.config, given)
         start = start_for(self.source, self.config, lights, given)

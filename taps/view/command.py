@@ -6,7 +6,6 @@ import argparse
 import asyncio
 import contextlib
 import errno
-import logging
 import multiprocessing
 import os
 import socket
@@ -27,12 +26,14 @@ from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError
 from daemon.publish.modbus.client import NoAnswer
 from daemon.publish.stream.client import Stream
+from daemon.replay.sources import open_log
 from daemon.system import console
 from daemon.system.logging import to_journal
+from hal.errors import HalError
 from hal.run_server import stop_event
 from taps.access_guard import Guard, TokenRefused, token_for
 from taps.view.page_hello import Scene, SceneUnreadable, scene_of
-from taps.view.replay_file import ReplayFile
+from taps.view.replay_file import ReplayFile, end_message
 from taps.view.server import TOPICS, View
 
 PORT: Final = 8090
@@ -117,12 +118,17 @@ def _record(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], ou
     from daemon.runtime import warmup
 
     try:
+        source = open_log(log)
+    except HalError as error:
+        out.write_bytes(end_message(0.0, str(error)))
+        return
+    try:
         warmup.load_aloud(console.say, "warm", warmup.load, "taps.view.replay_recorder")
     except warmup.CannotLoad as error:
         console.fail(str(error))
         return
     try:
-        import_module("taps.view.replay_recorder").record(log, settings, given, out)
+        import_module("taps.view.replay_recorder").record(source, settings, given, out)
     except OSError as error:
         console.fail(f"{out}: {error.strerror}; the recording is shown as far as it was replayed")
 
@@ -139,7 +145,6 @@ def _wait(film: ReplayFile) -> None:
 
 def _serve(view: View, guard: Guard, port: int, what: str) -> int:
     """Serve until interrupted."""
-    logging.basicConfig(level=logging.WARNING, format="lumiloop: %(message)s")
     try:
         asyncio.run(_until_signal(view, guard, port, what))
     except OSError as error:
@@ -151,7 +156,7 @@ def _serve(view: View, guard: Guard, port: int, what: str) -> int:
 
 async def _until_signal(view: View, guard: Guard, port: int, what: str) -> None:
     stop = stop_event()
-    runner = web.AppRunner(view.app(), access_log=None, shutdown_timeout=1.0)
+    runner = view.runner()
     await runner.setup()
     try:
         site = web.TCPSite(runner, guard.bind, port)

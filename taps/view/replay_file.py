@@ -26,6 +26,16 @@ DIED: Final = "the replay has died before its end (no memory, or no room in the 
 _tile: Final = msgspec.msgpack.Decoder(tuple[int, int, bytes, dict[str, float]]).decode
 
 
+def end_message(t_mono: float, error: str) -> bytes:
+    """The message at the end of a file, with the reason where that is before the recording's end."""
+    return message(t_mono, "end", error.encode())
+
+
+def message(t_mono: float, kind: str, body: bytes) -> bytes:
+    """One message of a file."""
+    return HEAD.pack(t_mono, KINDS.index(kind), len(body)) + body
+
+
 @dataclass(slots=True)
 class Track:
     """Times and file offsets of the messages of one kind."""

@@ -25,12 +25,12 @@ from daemon.publish.stream.server import Client, StreamServer
 from daemon.publish.stream.ticker import in_words, place_of
 from daemon.replay.recorded_inputs import Given, config_for, lights_for, start_for
 from daemon.replay.runner import Rerun
-from daemon.replay.sources import open_log
+from daemon.replay.sources import Source
 from daemon.runtime import warmup
 from hal.errors import HalError
 from hal.lidar import RawScan
 from taps.view.page_hello import scene_of
-from taps.view.replay_file import HEAD, KINDS
+from taps.view.replay_file import end_message, message
 from taps.view.viewers import History, about_of, encode, frame
 
 TOPICS: Final = frozenset({"pose", "lights", "scan", "state", "loop", "faults", "map"})
@@ -80,7 +80,7 @@ class ReplayRecorder(Client):
 
     def end(self, error: str) -> None:
         """Write the end message."""
-        self._write("end", error.encode())
+        self._out.write(end_message(self.t_mono, error))
         self._out.flush()
 
     def flush(self) -> None:
@@ -93,19 +93,18 @@ class ReplayRecorder(Client):
             self._write("map", encode([column, row, cells, about]))
 
     def _write(self, kind: str, body: bytes) -> None:
-        self._out.write(HEAD.pack(self.t_mono, KINDS.index(kind), len(body)))
-        self._out.write(body)
+        self._out.write(message(self.t_mono, kind, body))
 
 
-def record(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
+def record(source: Source, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
     """Write the replay file at low priority: the body of a process."""
     with contextlib.suppress(OSError):
         os.nice(10)
     with contextlib.suppress(KeyboardInterrupt):
-        make(log, settings, given, out)
+        make(source, settings, given, out)
 
 
-def make(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
+def make(source: Source, settings: Config, given: tuple[bool, tuple[str, ...]], out: Path) -> None:
     """Write the replay file. ``given``: see `daemon.replay.recorded_inputs.Given`.
 
     An error of the recording is stored in the end message.
@@ -113,25 +112,24 @@ def make(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], out: 
     Raises:
         OSError: the replay file cannot be written; it ends there.
     """
-    asyncio.run(_record(log, settings, Given(*given), out))
+    asyncio.run(_record(source, settings, Given(*given), out))
 
 
-async def _record(log: Path, settings: Config, given: Given, out: Path) -> None:
+async def _record(source: Source, settings: Config, given: Given, out: Path) -> None:
     with out.open("wb") as file:
         server = StreamServer(out, settings.name, lambda reason: REASONS[Reason(reason)])
         recorder = ReplayRecorder(server, file)
         server.clients.add(recorder)
         error = ""
         try:
-            await _run(log, settings, given, server, recorder)
+            await _run(source, settings, given, server, recorder)
         except (HalError, SurveyError, warmup.CannotLoad, OSError, ValueError) as problem:
             error = str(problem) or type(problem).__name__
         finally:
             recorder.end(error)
 
 
-async def _run(log: Path, settings: Config, given: Given, server: StreamServer, recorder: ReplayRecorder) -> None:
-    source = open_log(log)
+async def _run(source: Source, settings: Config, given: Given, server: StreamServer, recorder: ReplayRecorder) -> None:
     used = config_for(source, settings, given)
     lights = lights_for(source, used, given)
     recorder.scene(asdict(scene_of(used, None if lights is None else lights.survey)))

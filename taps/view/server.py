@@ -8,7 +8,6 @@ import hashlib
 import json
 import logging
 import time
-from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from dataclasses import asdict
 from importlib import resources
@@ -21,12 +20,14 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from daemon.publish.stream.client import Lost, Stream
 from daemon.publish.stream.messages import Hello, NotTheStream, Refused
+from hal.net.peers import full_for, host_of, largest, most_of
 from taps.access_guard import HEADERS, Guard
 from taps.command_client import CommandRefused
 from taps.view.orders import Orders
 from taps.view.page_hello import Scene, SceneUnreadable, welcome
 from taps.view.replay_file import ReplayFile
 from taps.view.replay_player import ReplayPlayer
+from taps.view.request_log import request_log
 from taps.view.viewers import Hub, Viewer, frame
 
 log = logging.getLogger(__name__)
@@ -41,8 +42,9 @@ SUFFIXES: Final = {
 }
 VIEWERS: Final = 32
 UNAUTHENTICATED: Final = 16
-"""Most connections before authentication; a further one replaces the oldest. They do not count as viewers."""
-FULL: Final = f"{VIEWERS} browsers are watching; close one."
+"""Most connections before authentication; they do not count as viewers. A further one replaces the oldest one of the
+host that has most of them."""
+FULL: Final = f"{VIEWERS} browsers are watching, or {most_of(VIEWERS)} of one computer; close one."
 PACE_S: Final = 0.04
 """Least time between two messages to a browser."""
 KEPT_BYTES: Final = 64 << 10
@@ -85,8 +87,8 @@ class View:
         self._orders = Orders(*modbus, notify=lambda order: self.hub.broadcast("order", order), stream=stream)
         self._count = 0
         self._guesses = asyncio.Semaphore(GUESSES)
-        self._sockets: set[web.WebSocketResponse] = set()
-        self._unauthenticated: deque[web.WebSocketResponse] = deque()
+        self._sockets: dict[web.WebSocketResponse, str] = {}
+        self._unauthenticated: dict[web.WebSocketResponse, str] = {}
 
     def app(self) -> web.Application:
         """The aiohttp application."""
@@ -96,6 +98,10 @@ class View:
         app.cleanup_ctx.append(self._following)
         app.on_shutdown.append(self._close_all)
         return app
+
+    def runner(self, shutdown_s: float = 1.0) -> web.AppRunner:
+        """The application's runner; at its end connections have ``shutdown_s`` to close."""
+        return web.AppRunner(self.app(), access_log=None, logger=request_log(), shutdown_timeout=shutdown_s)
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -129,26 +135,29 @@ class View:
         await socket.prepare(request)
         _limit_buffers(request)
         try:
-            if (viewer := await self._admit(socket)) is not None:
+            if (viewer := await self._admit(socket, request.remote or "")) is not None:
                 await self._serve(socket, viewer)
         except ConnectionResetError:
             pass  # the page was closed during a transmission
         finally:
-            self._sockets.discard(socket)
+            self._sockets.pop(socket, None)
         return socket
 
-    async def _admit(self, socket: web.WebSocketResponse) -> Viewer | None:
+    async def _admit(self, socket: web.WebSocketResponse, host: str) -> Viewer | None:
         """Admit a connection as a viewer; None: it was refused, with a reason."""
-        if len(self._unauthenticated) >= UNAUTHENTICATED:
-            await _refuse(self._unauthenticated.popleft(), "words", "Others came before it said who it is.")
-        self._unauthenticated.append(socket)
+        waiting = self._unauthenticated
+        if len(waiting) >= UNAUTHENTICATED:
+            most = largest(waiting.values())
+            oldest = next(one for one, peer in waiting.items() if host_of(peer) == most)
+            del waiting[oldest]
+            await _refuse(oldest, "words", "Others came before it said who it is.")
+        waiting[socket] = host
         try:
-            return await self._authenticate(socket)
+            return await self._authenticate(socket, host)
         finally:
-            with contextlib.suppress(ValueError):  # it was replaced by another one
-                self._unauthenticated.remove(socket)
+            waiting.pop(socket, None)  # it may have been replaced by another one
 
-    async def _authenticate(self, socket: web.WebSocketResponse) -> Viewer | None:
+    async def _authenticate(self, socket: web.WebSocketResponse, host: str) -> Viewer | None:
         """Authenticate a connection by its first message."""
         message = await _receive_json(socket, HELLO_S)
         token = None if message is None else message.get("token")
@@ -161,10 +170,10 @@ class View:
         if not self._guard.may_watch(token):
             await _refuse(socket, "token", "This page is shown to those who have its token.")
             return None
-        if len(self._sockets) >= VIEWERS:
+        if len(self._sockets) >= VIEWERS or full_for(host, self._sockets.values(), VIEWERS):
             await _refuse(socket, "full", FULL)
             return None
-        self._sockets.add(socket)
+        self._sockets[socket] = host
         self._count += 1
         viewer = Viewer(self._count, self._guard.may_command(token) and self._film is None)
         recording = None if self._film is None else self._film.source

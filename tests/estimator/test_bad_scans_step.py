@@ -36,6 +36,12 @@ MALFORMED: dict[str, Callable[[Scan], Scan]] = {
     "a bearing that is no number": lambda scan: replace(scan, bearing_rad=np.where(np.arange(N) == 7, np.nan, BEARING)),
     "a bearing without end": lambda scan: replace(scan, bearing_rad=np.where(np.arange(N) == N - 1, np.inf, BEARING)),
     "one bearing for all": lambda scan: replace(scan, bearing_rad=np.zeros(N)),
+    "bearings that hardly differ": lambda scan: replace(scan, bearing_rad=1e-300 * np.arange(N)),
+    "a field of a degree": lambda scan: replace(scan, bearing_rad=np.linspace(0.0, np.radians(1.0), N)),
+    "a field of twenty degrees, clockwise": lambda scan: replace(scan, bearing_rad=np.linspace(0.35, 0.0, N)),
+    "beams in a bunch, and one away from it": lambda scan: replace(
+        scan, bearing_rad=np.append(np.linspace(0.0, 0.1, N - 1), 2.0)
+    ),
     "bearings that turn back": lambda scan: replace(scan, bearing_rad=BENT),
     "bearings of two turns": lambda scan: replace(scan, bearing_rad=np.linspace(-7.0, 7.0, N)),
     "a mount that is no number": lambda scan: replace(scan, T_base_lidar=np.array((0.0, np.nan, 0.0))),
@@ -222,7 +228,13 @@ def test_a_hundred_thousand_beams() -> None:
 
 ODD = st.sampled_from([0.0, -0.0, -1.0, 1e-300, 1e300, np.nan, np.inf, -np.inf, 80.0, 80.1])
 LENGTH = st.one_of(st.integers(0, 12), st.just(N))
-SPAN = st.one_of(st.just((float(BEARING[0]), float(BEARING[-1]))), st.tuples(ODD, ODD), st.just((1.0, -1.0)))
+NARROW = st.tuples(st.floats(-2.0, 2.0), st.floats(1e-12, 0.4), st.sampled_from((-1.0, 1.0)))
+SPAN = st.one_of(
+    st.just((float(BEARING[0]), float(BEARING[-1]))),
+    st.tuples(ODD, ODD),
+    st.just((1.0, -1.0)),
+    NARROW.map(lambda one: (one[0], one[0] + one[1] * one[2])),
+)
 FUZZ = st.tuples(
     LENGTH,
     SPAN,
@@ -271,6 +283,8 @@ left for them: it once fitted a wall nine metres off."""
 @settings(max_examples=15, deadline=None)
 @given(cases=st.lists(FUZZ, min_size=1, max_size=6))
 @example(cases=FELL_TOGETHER)
+@example(cases=[(N, (0.0, 1e-300), "room", 0, 0.01, 0.25, (0.0, 0.0, 0.0))])
+@example(cases=[(N, (-1.0, -0.97), "room", 1, 0.01, 0.25, (0.0, 0.0, 0.0))])
 def test_whatever_comes_the_step_goes_on(
     method_name: str, cases: list[tuple[int, tuple[float, float], str, int, float, float, tuple[float, ...]]]
 ) -> None:

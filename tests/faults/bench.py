@@ -47,13 +47,13 @@ class World:
             return None
         candidates = range(residue, len(self.starts), 2000)
         nearest = min(candidates, key=lambda k: abs(self.starts[k] - scan.t_mono), default=None)
-        return nearest if scan.ranges.size == -(-(self._model.steps - self._model.amin) // scan.stride) else None
+        return nearest if scan.ranges.size == (self._model.steps - self._model.amin) // scan.stride else None
 
     def error_s(self, scan: RawScan) -> float:
         """How far the stamp of a scan is off: its first beam's time against the sensor's own."""
         number = self.number(scan)
         assert number is not None
-        first_beam = scan.first_step * self._model.true_period_s / self._model.ares
+        first_beam = (scan.first_step + 0.5 * (scan.stride - 1)) * self._model.true_period_s / self._model.ares
         return scan.t_mono - (self.starts[number] + first_beam)
 
 

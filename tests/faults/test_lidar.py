@@ -22,7 +22,7 @@ AT_ONCE = 0.08
 """Seconds: two revolutions and the time on the line."""
 RESTART = 1.0
 REOPEN = 4.0
-"""Pauses double up to 5 s; after a fault of 3 s they have not grown beyond this."""
+"""Pauses double up to 4 s; after a fault of 3 s they have not grown beyond this."""
 GENERAL = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
 
 
@@ -141,6 +141,11 @@ COMMANDS = [
     Case("semicolon", "what = 'semicolon'", (), RESTART, start=True),
     Case("dmax", "what = 'dmax'", (), RESTART, start=True),
     Case("trouble", "what = 'trouble'", (), RESTART, start=True),
+    Case("VV denied", "what = 'denied'", (), RESTART, start=True),
+    Case("vendor", "what = 'vendor'", (), RESTART, start=True),
+    Case("parameter", "what = 'parameter'", (), RESTART, start=True),
+    Case("not_ready", "what = 'not_ready'; by_s = 3.0", ("~not now",), 2.0, start=True),
+    Case("not_ready, error state", "what = 'not_ready'; by_s = 3.0; status = '0L'", ("~0L",), 5.0, start=True),
     Case("scip1 from the start", "what = 'scip1'", (), RESTART, start=True),
     Case("scip1", "what = 'scip1'", ("resyncs", "~fallen silent"), RESTART),
     Case("dark from the start", "what = 'dark'", (), RESTART, start=True, intensity=True),

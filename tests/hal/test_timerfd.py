@@ -22,15 +22,13 @@ def test_once_and_not_before_the_latest_instant_ordered(make: Make) -> None:
         due = loop.time() + 0.06
         one.at(loop.time() + 0.01)
         one.at(due)
-        await asyncio.sleep(0.03)
-        assert rung == []
         await asyncio.sleep(0.2)
         one.close()
         one.close()
         return [at - due for at in rung]
 
     (late,) = asyncio.run(go())
-    assert late >= -1e-4
+    assert late >= -1e-4, "not at the instant ordered first, 0.05 s before"
 
 
 @pytest.mark.parametrize("make", [KernelTimer, LoopTimer])

@@ -8,6 +8,7 @@ from pathlib import Path
 from daemon.config.schema import Config
 from daemon.replay import convert
 from daemon.replay.log_replay import Outcome, replay
+from daemon.replay.sources import open_log
 from daemon.replay.trajectories import Ledger
 from tests.daemon.replay.room import carmen, drive
 from tests.logs import made
@@ -45,7 +46,7 @@ def prepared(entry: Entry, root: Path | None, folder: Path) -> Path:
 
 def replayed(entry: Entry, root: Path | None, folder: Path) -> Outcome:
     """The log through the pipeline as a stranger's: no configuration, no recorded caps."""
-    outcome = replay(prepared(entry, root, folder), Config())
+    outcome = replay(open_log(prepared(entry, root, folder)), Config())
     assert not outcome.stopped
     return outcome
 

@@ -12,6 +12,7 @@ from daemon.config.schema import Config
 from daemon.replay.convert import convert
 from daemon.replay.log_replay import replay
 from daemon.replay.results import Trajectory
+from daemon.replay.sources import open_log
 from daemon.snapshot import GUESSED, State
 from tests.logs.catalog import ledger_of
 
@@ -100,7 +101,7 @@ def run(drive: Path, spoil: Spoil, path: Path) -> Trajectory:
     scans = [line for line in lines if line and line[0] == "ROBOTLASER1"]
     rest = [line for line in lines if not line or line[0] != "ROBOTLASER1"]
     path.write_text("".join(" ".join(line) + "\n" for line in rest + spoil(scans)))
-    return ledger_of(replay(path, Config())).online()
+    return ledger_of(replay(open_log(path), Config())).online()
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -54,7 +54,7 @@ def turn(server: StreamServer, number: int, place: tuple[float, float, float] | 
     server.on_scan(raw_scan(number))
     server.on_raw("lidar", "rx", t, b"99b")
     if number % 20 == 5:
-        server.on_faults(t, [(104, "no valid scan", "check the cable")] if number % 40 == 5 else [])
+        server.on_faults(t, [(104, "no valid scan", "check the cable", 0)] if number % 40 == 5 else [])
         server.on_statistics(lambda: {"t_mono": t, "cycles": number, "uptime": t, "memory_mb": 99.5})
 
 

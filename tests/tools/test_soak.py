@@ -7,20 +7,23 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tools.soak.watched import Watch
+from tools.soak.watched import Watch, growth, stored
 
 ROOT = Path(__file__).parents[2]
 
 
-def watch(slope_mb_h: float, files: int = 10) -> Watch:
+def watch(slope_mb_h: float, files: int = 10, grows: float = 0.0) -> Watch:
     """Six hours: half an hour of start, then a slope; one file more at the end than at the begin, or as many."""
     rows = []
     for k in range(1, 61):
         hours = 0.1 * k
         memory = 300.0 + min(hours, 0.5) * 200.0 + slope_mb_h * hours
-        rows.append((hours, memory, float(10 if k < 50 else files), 2.0, 1.0, 2.0, 3.0))
+        rows.append(
+            (hours, memory, float(10 if k < 50 else files), 2.0, 7.0, 3.0 + hours, 1.0 + grows * hours, 2.0, 3.0)
+        )
     return Watch(rows)
 
 
@@ -29,6 +32,28 @@ def test_a_slope_after_the_start_is_told() -> None:
     assert by_name["memory, slope"].value == pytest.approx(0.1)
     assert all(row.ok is not False for row in by_name.values())
     assert {row.name: row for row in watch(0.7).figures("x")}["memory, slope"].ok is False
+
+
+def test_growth_of_descriptors_files_and_cycles_is_told() -> None:
+    by_name = {row.name: row for row in watch(0.0, files=11, grows=0.2).figures("x")}
+    assert by_name["descriptors, growth"].ok is False
+    assert by_name["cycle, slope of the median"].ok is False
+    assert by_name["stored_mb, slope"].value == pytest.approx(1.0)
+    assert by_name["stored_files, slope"].value == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_descriptor_that_is_open_for_a_moment_is_no_growth() -> None:
+    assert growth(np.array([23.0, 24.0, 23.0, 23.0, 23.0, 24.0, 23.0, 23.0, 24.0])) == 0.0
+    assert growth(np.array([23.0, 23.0, 23.0, 24.0, 24.0, 24.0, 25.0, 25.0, 25.0])) == 2.0
+
+
+def test_stored_files_are_those_below_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "one").write_bytes(bytes(1_000_000))
+    (tmp_path / "two").write_bytes(bytes(500_000))
+    (tmp_path / "link").symlink_to("nowhere")
+    assert stored(tmp_path) == (2.0, 1.5)
+    assert stored(None) == (0.0, 0.0)
 
 
 @pytest.mark.system
@@ -41,7 +66,7 @@ def test_nothing_grows_in_a_day(days: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     rows = {row["name"]: row["value"] for row in json.loads((tmp_path / "days.json").read_text())}
     assert rows["memory, slope"] <= 0.5, done.stdout
-    assert rows["files, most less least"] == rows["threads, most less least"] == 0.0
+    assert rows["descriptors, growth"] == rows["threads, growth"] == 0.0
     assert rows["cycles in TRACKING"] > 0.3
     assert rows["position error, median"] < 0.3
     assert (tmp_path / "days.png").exists()

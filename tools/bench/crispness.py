@@ -99,7 +99,7 @@ def load(source: Path, method: str = LUMILOOP) -> Drive:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "scans.log"
         convert.convert(source, log)
-        outcome = replay(log, Config(), method=method)
+        outcome = replay(open_log(log), Config(), method=method)
         return drive_of(outcome, log)
 
 

@@ -14,6 +14,7 @@ from typing import Final
 from daemon.config.schema import Config
 from daemon.replay import convert
 from daemon.replay.log_replay import Outcome, replay
+from daemon.replay.sources import open_log
 from tools.ci.figures import Figure, bounded
 from tools.relations import SPLIT_S, Errors, evaluate, read_relations
 
@@ -33,7 +34,7 @@ def run() -> list[Figure]:
 
 
 def _intel(folder: Path) -> list[Figure]:
-    outcome = replay(folder / "intel.clf.gz", Config())
+    outcome = replay(open_log(folder / "intel.clf.gz"), Config())
     relations = read_relations(folder / "intel.relations")
     final, online = outcome.rerun.ledger.final(), outcome.rerun.ledger.online()
     alone = evaluate(final.stamps, outcome.rerun.ledger.odom(), relations)
@@ -65,7 +66,7 @@ def _utm(source: Path) -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "utm.log"
         convert.write(log, convert.read(source), source.name)
-        outcome = replay(log, Config())
+        outcome = replay(open_log(log), Config())
     speed = _speed(outcome)
     return [bounded("utm30lx, 1081 beams at 40 Hz, replay speed", speed, "x real time", ">= 8", COMMAND)]
 

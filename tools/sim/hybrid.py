@@ -179,4 +179,4 @@ def fitted_model(scan: RawScan, period_s: float) -> LidarModel:
 
 def _front(geometry: LidarGeometry, scan: RawScan) -> float:
     """Front step counted from the first beam, in beams."""
-    return (geometry.afrt - scan.first_step) / scan.stride
+    return (geometry.afrt - scan.first_step - 0.5 * (scan.stride - 1)) / scan.stride

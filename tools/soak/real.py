@@ -1,8 +1,9 @@
-"""Hours of the real processes: the daemon as a person starts it, and the demo's simulator; nothing is shortened."""
+"""Hours of the real processes: the daemon, which keeps maps and a recording, and the demo's simulator, in real time."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import socket
 import subprocess
@@ -45,7 +46,8 @@ def run(seconds: float, seed: int, out: Path, say: Callable[[str], None]) -> Wat
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="lumiloop-soak-") as holder, contextlib.ExitStack() as stack:
         folder, modbus, odometry = Path(holder), free_port(), free_port()
-        config = write_config(folder, modbus, odometry)
+        config, stored = write_config(folder, modbus, odometry), folder / "stored"
+        stored.mkdir()
         truth = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         truth.bind(("127.0.0.1", 0))  # a socket of its own, never read
         words = [sys.executable, "-m", "tools.sim", "--building", "paper_room", "--seed", str(seed), "--hold"]
@@ -57,13 +59,24 @@ def run(seconds: float, seed: int, out: Path, say: Callable[[str], None]) -> Wat
             simulator = stack.enter_context(running(words, out / "simulator.log", stdout=subprocess.PIPE))
             wait_for_simulator(simulator, patience)
             daemon_words = [sys.executable, "-m", "daemon", "run", "--config", str(config)]
-            daemon = stack.enter_context(running(daemon_words, out / "daemon.log", stdout=subprocess.DEVNULL))
+            daemon_words += [
+                "--set",
+                f"map.folder={stored / 'maps'}",
+                "--record",
+                str(stored / "record"),
+                "--last",
+                "10",
+            ]
+            space = dict(os.environ, XDG_STATE_HOME=str(stored))
+            daemon = stack.enter_context(
+                running(daemon_words, out / "daemon.log", stdout=subprocess.DEVNULL, env=space)
+            )
             reader = stack.enter_context(Reader("127.0.0.1", modbus))
             wait_for_pose(daemon, reader, patience)
         except DemoError as error:
             raise Ended(str(error)) from error
         simulator.send_signal(signal.SIGUSR1)
-        return watched((daemon, simulator), reader, seconds, say)
+        return watched((daemon, simulator), reader, seconds, say, Watch(folder=stored))
 
 
 def watched(
@@ -71,9 +84,10 @@ def watched(
     reader: Reader,
     seconds: float,
     say: Callable[[str], None],
+    watch: Watch,
 ) -> Watch:
     """Rows about the daemon, as long as both processes live."""
-    watch, begin, unanswered = Watch(), time.monotonic(), 0
+    begin, unanswered = time.monotonic(), 0
     while (t := time.monotonic() - begin) < seconds:
         for child in children:
             if child.poll() is not None:

@@ -11,12 +11,11 @@ import numpy as np
 
 from daemon.maps.carmen import carmen
 from daemon.maps.container import BadMap
-from daemon.maps.edit import LONGEST_NAME, Refused, called, keep, opened, put
+from daemon.maps.edit import LONGEST_NAME, Refused, called, keep, put
 from daemon.maps.grid_files import map_yaml, pgm
 from daemon.maps.image import image_from, meta_of, packed
 from daemon.maps.image_geometry import grid_of, lamps_of, placed
 from daemon.maps.map_drawing import draw
-from daemon.maps.map_server import BadMapServer, load
 from daemon.maps.png import encode_png
 from daemon.replay.results import Folder, OutputRefused, Trajectory, tum
 from daemon.system import console
@@ -27,7 +26,7 @@ from estimator import Identity, image_of_cells
 def export(args: argparse.Namespace) -> int:
     """Writes the requested formats of a map file; returns the exit code."""
     try:
-        image = image_from(opened(args.log))
+        image = image_from(args.stored)
         folder = Folder(args.out)
         frames = placed(image)
         written: list[str] = []
@@ -54,7 +53,7 @@ def export(args: argparse.Namespace) -> int:
 def render(args: argparse.Namespace) -> int:
     """Writes an image of a map file; returns the exit code."""
     try:
-        image = image_from(opened(args.map))
+        image = image_from(args.stored)
         pixels = draw(grid_of(image), np.zeros((0, 3)), lamps_of(image))
         Folder(args.out.parent).write(args.out.name, encode_png(pixels))
     except (BadMap, OutputRefused, OSError) as error:
@@ -66,14 +65,14 @@ def render(args: argparse.Namespace) -> int:
 def take_in(args: argparse.Namespace) -> int:
     """Makes a map file of a map_server map; returns the exit code."""
     try:
-        described, cells = load(args.yaml)
+        described, cells = args.described
         named = called(args.name) if args.name else args.yaml.stem[:LONGEST_NAME]
         identity = Identity(1 + secrets.randbelow(2**32 - 1), named)
         origin = np.array(described.origin)
         image = image_of_cells(cells, described.resolution, origin, identity)
         content = packed(image, meta_of(image, time.time(), "", release()))
         path = keep(args.settings, content, identity.map_id) if args.out is None else put(args.out, content)
-    except (BadMapServer, BadMap, Refused, OSError) as error:
+    except (BadMap, Refused, OSError) as error:
         return console.fail(str(error))
     except ValueError as error:
         return console.fail(f"{args.yaml}: {error}")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from daemon.cli import replay
-from daemon.maps.container import MAGIC
 from daemon.maps.grid_files import map_files
 from daemon.replay import log_replay
 from daemon.replay.results import Folder
@@ -15,7 +13,7 @@ from daemon.system import console
 
 def main(args: argparse.Namespace) -> int:
     """Runs the command; returns the exit code."""
-    if is_map(args.log):
+    if args.stored is not None:
         from daemon.cli.maps import convert
 
         return convert.export(args)
@@ -24,15 +22,6 @@ def main(args: argparse.Namespace) -> int:
             f"{args.log}: --tum and --carmen are of map files; `lumiloop replay` writes a log's trajectory"
         )
     return replay.command(args, _write)
-
-
-def is_map(path: Path) -> bool:
-    """True if the source is a map file; errors of an unreadable file are reported by its reader."""
-    try:
-        with path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return path.suffix == ".lumimap"
 
 
 def _write(folder: Folder, outcome: log_replay.Outcome) -> None:

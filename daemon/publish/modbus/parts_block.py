@@ -73,8 +73,8 @@ def _names(meanings: dict[Part, str] | dict[Thread, str]) -> str:
 POINTS: Final = (
     Point("uptime", "time since the start", U32, lambda s: _condition(s).uptime_s, "Of the process.",
           unit="s", can_be_unknown=False),
-    Point("faults", "faults present", U16, lambda s: len(_condition(s).faults), "The gravest are named below.",
-          can_be_unknown=False),
+    Point("faults", "faults present", U16, lambda s: len(_condition(s).faults),
+          "The gravest are named below, each before those that follow from it.", can_be_unknown=False),
     *(
         Point(f"fault_{k + 1}", "fault" if k else "gravest fault", U16, _fault(k), "0: no further one.",
               can_be_unknown=False)

@@ -4,8 +4,9 @@ pymodbus's framer and message classes encode and decode application data units a
 published block has a fast path, because nearly every request is one; a test compares its bytes with those of the
 general path.
 
-Functions: 3 and 4 (read holding, read input registers: both return the published blocks, 3 also the writable ones), 6
-and 16 (write, where writing is allowed). Any unit identifier is accepted and returned: there is one device behind it.
+Functions: 3 and 4 (read holding, read input registers: both return the published blocks, 3 also the writable ones), 6,
+16 and 23 (write, write and read, where writing is allowed), 43 with MEI type 14 (device identification). Any unit
+identifier is accepted and returned: there is one device behind it.
 (MODBUS Application Protocol V1.1b3; MODBUS Messaging on TCP/IP Implementation Guide V1.0b.)
 """
 
@@ -25,6 +26,8 @@ from pymodbus.pdu.register_message import (
     ReadHoldingRegistersResponse,
     ReadInputRegistersRequest,
     ReadInputRegistersResponse,
+    ReadWriteMultipleRegistersRequest,
+    ReadWriteMultipleRegistersResponse,
     WriteMultipleRegistersRequest,
     WriteMultipleRegistersResponse,
     WriteSingleRegisterRequest,
@@ -33,7 +36,9 @@ from pymodbus.pdu.register_message import (
 
 from daemon.publish.modbus import integrity_block, lights_block, parts_block, timing_block
 from daemon.publish.modbus.holding import Holding, Refused
+from daemon.publish.modbus.identification import READ_DEVICE_IDENTIFICATION, identify, objects_of
 from daemon.publish.modbus.registers import MIRROR_ADDRESS, MIRROR_WORDS
+from daemon.system.defects import Place, log_once
 
 HEADER_SIZE: Final = 7  # transaction, protocol, length, unit
 MAX_FRAME: Final = 260  # header and a body of at most 253 bytes
@@ -41,14 +46,18 @@ READ_HOLDING: Final = 3
 READ_INPUT: Final = 4
 WRITE_SINGLE: Final = 6
 WRITE_MULTIPLE: Final = 16
+READ_WRITE: Final = 23
 MAX_READ: Final = 125
 MAX_WRITE: Final = 123
+MAX_READ_WRITE: Final = 121
+"""Registers that one request may write that also reads."""
 
 log = logging.getLogger(__name__)
 
 _READ: Final = struct.Struct(">HHHBBHH")
 _READ_ANSWER: Final = struct.Struct(">HHHBBB")
 _FIXED_BODY: Final = 5  # function, address, count or value
+_READ_WRITE_HEAD: Final = 10  # function, address and count of both, number of bytes
 
 Make = Callable[[], bytes]
 BLOCKS: Final = (lights_block.BLOCK, integrity_block.BLOCK, timing_block.BLOCK, parts_block.BLOCK)
@@ -73,15 +82,17 @@ class Responder:
 
     Args:
         holding: writable registers, or None where writing is not allowed.
+        name: of the robot, for the device identification.
     """
 
-    def __init__(self, holding: Holding | None = None) -> None:
+    def __init__(self, holding: Holding | None = None, name: str = "lumiloop") -> None:
         self._holding = holding
+        self._identity = objects_of(name)
         self._framer = FramerSocket(DecodePDU(is_server=True))
         self._block = b""
         self._make: tuple[Make, ...] = ()
         self._made: dict[int, bytes] = {}
-        self._told = ""
+        self._defects: set[Place] = set()
 
     def show(self, block: bytes, *beside: Make) -> None:
         """Replace all blocks at once: no reply ever mixes two snapshots.
@@ -124,20 +135,18 @@ class Responder:
                 return self._write_single(self._holding, body)
             if function == WRITE_MULTIPLE and self._holding is not None:
                 return self._write_multiple(self._holding, body)
+            if function == READ_WRITE and self._holding is not None:
+                return self._read_write(self._holding, body)
+            if function == READ_DEVICE_IDENTIFICATION:
+                return identify(self._identity, body)
         except Refused:
             return ExceptionResponse(function, ExcCodes.ILLEGAL_ADDRESS)
         except (ValueError, IndexError, struct.error, ModbusException):
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
         except Exception as error:  # noqa: BLE001  any failure is reported to the client and logged
-            self._failed(error)
+            log_once(log, self._defects, error, "a Modbus request cannot be answered; its client is told exception 4")
             return ExceptionResponse(function, ExcCodes.DEVICE_FAILURE)
         return ExceptionResponse(function, ExcCodes.ILLEGAL_FUNCTION)
-
-    def _failed(self, error: Exception) -> None:
-        """Log a defect with its traceback; once, because clients repeat their requests."""
-        if repr(error) != self._told:
-            self._told = repr(error)
-            log.error("a Modbus request cannot be answered; its client is told exception 4", exc_info=error)
 
     def _read(self, function: int, body: bytes) -> ModbusPDU:
         holding = function == READ_HOLDING
@@ -186,3 +195,16 @@ class Responder:
             raise ValueError("count and bytes disagree")
         holding.write(request.address, data)
         return WriteMultipleRegistersResponse(address=request.address, count=request.count)
+
+    def _read_write(self, holding: Holding, body: bytes) -> ModbusPDU:
+        """Write, then read; nothing is written where the read is not possible."""
+        request = ReadWriteMultipleRegistersRequest()
+        request.decode(body[1:])
+        data = body[_READ_WRITE_HEAD:]
+        sizes = {request.write_byte_count, 2 * request.write_count, len(data)}
+        if not 1 <= request.read_count <= MAX_READ or not 1 <= request.write_count <= MAX_READ_WRITE or len(sizes) > 1:
+            raise ValueError("count and bytes disagree")
+        self._registers(request.read_address, request.read_count, holding=True)
+        holding.write(request.write_address, data)
+        read = self._registers(request.read_address, request.read_count, holding=True)
+        return ReadWriteMultipleRegistersResponse(registers=list(struct.unpack(f">{request.read_count}H", read)))

@@ -42,7 +42,8 @@ class ModbusPublisher:
 
     Args:
         clock: time of arrival of written odometry.
-        write: whether commands and odometry may be written. allowed: whether a host may be served.
+        name: of the robot. write: whether commands and odometry may be written.
+        allowed: whether a host may be served.
         on_command: receives each command; report its end by :meth:`acknowledge`.
         on_odometry: receives each written odometry reading. on_loop_seen: number of acknowledged loop closures.
     """
@@ -51,6 +52,7 @@ class ModbusPublisher:
         self,
         clock: Clock,
         *,
+        name: str = "lumiloop",
         write: bool = False,
         allowed: Allowed = everyone,
         on_command: Callable[[Request], None] = _ignore,
@@ -62,7 +64,7 @@ class ModbusPublisher:
         self._allowed = allowed
         self._continuity = Continuity()
         self._holding = Holding(on_command, self._take_odometry, on_loop_seen) if write else None
-        self._responder = Responder(self._holding)
+        self._responder = Responder(self._holding, name)
         self._share = Share()
         self._age_s = 0.0  # of the datagram in processing
         self._udp: list[UdpEndpoint] = []

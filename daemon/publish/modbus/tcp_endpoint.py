@@ -8,9 +8,11 @@ import socket
 from collections import deque
 from typing import Final
 
-from daemon.publish.modbus.counts import CROWDED, MAX_CONNECTIONS, STRANGE, Allowed, Counts, everyone
+from daemon.publish.modbus.counts import CROWDED, GREEDY, MAX_CONNECTIONS, STRANGE, Allowed, Counts, everyone
 from daemon.publish.modbus.requests import Responder, frame_size
+from daemon.system.defects import Place, log_once
 from hal.net.fair_share import Share
+from hal.net.peers import full_for, host_of, largest
 
 log = logging.getLogger(__name__)
 
@@ -142,6 +144,7 @@ class TcpEndpoint:
         self._connections: dict[Connection, None] = {}
         self._waiting: deque[Connection] = deque()
         self._servers: list[asyncio.Server] = []
+        self._defects: set[Place] = set()
         self._again: asyncio.TimerHandle | None = None
         self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
 
@@ -163,12 +166,13 @@ class TcpEndpoint:
             await server.wait_closed()
 
     def admit(self, connection: Connection) -> None:
-        """Accept a connection. At the largest number, the longest idle one is closed, or else the new one refused."""
-        if len(self._connections) >= MAX_CONNECTIONS:
-            oldest = min(self._connections, key=lambda c: c.last_request)
-            if self._loop.time() - oldest.last_request <= EVICT_S:
+        """Accept a connection; where there is no place for it, close another one or refuse it."""
+        peers = [one.peer for one in self._connections]
+        greedy = full_for(connection.peer, peers, MAX_CONNECTIONS)
+        if greedy or len(peers) >= MAX_CONNECTIONS:
+            if (oldest := self._replaceable(connection, greedy)) is None:
                 self.counts.refused += 1
-                self.counts.tell(connection.peer, CROWDED)
+                self.counts.tell(connection.peer, GREEDY if greedy else CROWDED)
                 connection.abort()
                 return
             self.counts.dropped += 1
@@ -176,6 +180,22 @@ class TcpEndpoint:
             self.forget(oldest)
         self._connections[connection] = None
         self.counts.connections = len(self._connections)
+
+    def _replaceable(self, new: Connection, greedy: bool) -> Connection | None:
+        """The connection that makes place for a new one.
+
+        It is the longest idle one, if idle for :data:`EVICT_S`; that of the new one's host where this has its share.
+        Otherwise it is one of the host with the most connections, if that host has more than the new one's.
+        """
+        own = [one for one in self._connections if host_of(one.peer) == host_of(new.peer)]
+        oldest = min(own if greedy else self._connections, key=_idle_since)
+        if self._loop.time() - oldest.last_request > EVICT_S:
+            return oldest
+        if greedy:
+            return None
+        most = largest(one.peer for one in self._connections)
+        theirs = [one for one in self._connections if host_of(one.peer) == most]
+        return min(theirs, key=_idle_since) if len(theirs) > len(own) + 1 else None
 
     def forget(self, connection: Connection) -> None:
         """Remove a closed connection."""
@@ -209,8 +229,8 @@ class TcpEndpoint:
         """As :meth:`Connection.serve`; a connection that fails is closed, and the others are still served."""
         try:
             return connection.serve(most)
-        except Exception:
-            log.exception("a Modbus client cannot be served; it is disconnected")
+        except Exception as error:  # noqa: BLE001  any failure closes this connection alone
+            log_once(log, self._defects, error, "a Modbus client cannot be served; it is disconnected")
             connection.abort()
             return False
 
@@ -220,3 +240,7 @@ class TcpEndpoint:
             self.counts.dropped += 1
             connection.abort()
         self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
+
+
+def _idle_since(connection: Connection) -> float:
+    return connection.last_request

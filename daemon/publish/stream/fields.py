@@ -30,7 +30,7 @@ FIELDS: Final[Mapping[str, Fields]] = {
         "t_mono": "s", "counter": "int", "keyframe_new": "int", "keyframe_old": "int", "reason": "int",
         "residual": "m", "at_new": "[m, m, rad] or nil", "at_old": "[m, m, rad] or nil",
     },
-    "faults": {"t_mono": "s or nil", "present": "list of {fault: int, meaning: str, remedy: str}"},
+    "faults": {"t_mono": "s or nil", "present": "list of {fault: int, meaning: str, remedy: str, cause: int}"},
     "statistics": {
         "t_mono": "s", "uptime": "s", "memory_mb": "MB", "cycles": "int", "overruns": "int", "cycle_us": "us or nil",
         "jobs_failed": "int", "scan_period": "s", "scans": "int", "scans_missed": "int", "scans_invalid": "int",

@@ -188,15 +188,16 @@ class Loop(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Fault(msgspec.Struct, frozen=True, kw_only=True):
-    """One present fault."""
+    """One present fault; ``cause``: the present fault that it follows from, 0: none."""
 
     fault: int
     meaning: str = ""
     remedy: str = ""
+    cause: int = 0
 
 
 class Faults(msgspec.Struct, frozen=True, kw_only=True):
-    """Topic ``faults``: all present faults, gravest first; the first message has no time."""
+    """Topic ``faults``: all present faults, gravest cause first, each before what follows; the first has no time."""
 
     present: tuple[Fault, ...]
     t_mono: float | None = None

@@ -41,6 +41,8 @@ __all__ = [
     "scan_message",
 ]
 
+FaultInWords = tuple[int, str, str, int]
+"""Number, meaning and remedy of a fault, and the number of the fault it follows from, 0: none."""
 Place = Callable[[int], tuple[float, float, float] | None]
 
 TILE_BYTES: Final = 32 << 10
@@ -167,9 +169,12 @@ class StreamServer:
         """Publish a block of the photodiode's samples."""
         self._tell("raw", lambda: _samples(block))
 
-    def on_faults(self, t_mono: float, faults: Iterable[tuple[int, str, str]]) -> None:
-        """Publish the present faults (number, meaning, remedy) if they have changed."""
-        told: list[dict[str, object]] = [{"fault": number, "meaning": m, "remedy": r} for number, m, r in faults]
+    def on_faults(self, t_mono: float, faults: Iterable[FaultInWords]) -> None:
+        """Publish the present faults if they have changed."""
+        told: list[dict[str, object]] = [
+            {"fault": number, "meaning": meaning, "remedy": remedy, "cause": cause}
+            for number, meaning, remedy, cause in faults
+        ]
         if told != self._faults:
             self._faults = told
             self._tell("faults", lambda: {"t_mono": t_mono, "present": told})

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
+import struct
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final, Protocol
@@ -16,6 +18,7 @@ import msgspec
 
 from daemon.maps.tiles import NOTHING_SHOWN
 from hal.net.fair_share import Share
+from hal.net.peers import most_of
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +35,7 @@ LATEST: Final = {
 ONCE: Final = {
     "state": "at first and at a change: state and reason, with meaning and remedy",
     "loop": "a loop closed: counter, both keyframes, residual, reason",
-    "faults": "at first and at a change: all that are present, with meaning and remedy",
+    "faults": "at first and at a change: all that are present, with meaning, remedy and cause",
 }
 """Topics of which a client receives every message, up to :data:`KEPT`."""
 RAW: Final = {"raw": "what passes between daemon and devices: bytes of the lidar's port, words of the photodiode"}
@@ -42,6 +45,7 @@ MAP: Final = {"map": "the map as tiles: at first all, then those that have chang
 TOPICS: Final[Mapping[str, str]] = {**LATEST, **ONCE, **RAW, **MAP}
 
 CLIENTS: Final = 32
+"""Clients at once. One process has at most half of the places, one user its share (`hal.net.peers`)."""
 KEPT: Final = 64
 RAW_KEPT: Final = 256
 BUFFER_BYTES: Final = 256 << 10
@@ -52,6 +56,8 @@ REQUESTS_PER_TURN: Final = 4
 STUCK_S: Final = 60.0
 """Time in s after which a client that reads nothing is disconnected."""
 
+_CREDENTIALS: Final = struct.Struct("@3i")
+
 encode: Final = msgspec.msgpack.Encoder().encode
 _request: Final = msgspec.msgpack.Decoder(dict[str, Any]).decode
 
@@ -60,6 +66,15 @@ def framed(message: Mapping[str, object]) -> bytes:
     """Encode a message with its length."""
     body = encode(message)
     return len(body).to_bytes(4, "little") + body
+
+
+def credentials(transport: asyncio.Transport) -> tuple[int, int]:
+    """IDs of the process and of the user at the other end (unix(7), SO_PEERCRED); 0, 0 where they are not known."""
+    sock = transport.get_extra_info("socket")
+    if sock is None:
+        return 0, 0
+    process, user, _ = _CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    return process, user
 
 
 class Server(Protocol):
@@ -86,12 +101,14 @@ class Client(asyncio.Protocol):
 
     Attributes:
         wants: subscribed topics. replaced: messages that a newer one replaced before they were sent.
+        process, user: IDs of the client; 0: not known.
         shown: the last tile of the map that was sent.
     """
 
     def __init__(self, server: Server) -> None:
         self.wants: frozenset[str] = frozenset()
         self.replaced = 0
+        self.process = self.user = 0
         self._server = server
         self._transport: asyncio.Transport | None = None
         self._received = bytearray()
@@ -112,11 +129,23 @@ class Client(asyncio.Protocol):
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         transport.set_write_buffer_limits(high=BUFFER_BYTES)
-        if len(self._server.clients) >= CLIENTS:
-            self._refuse(f"{CLIENTS} clients are being served; close one")
+        self.process, self.user = credentials(transport)
+        if reason := self._no_place():
+            self._refuse(reason)
             return
         self._server.clients.add(self)
         transport.write(framed(self._server.hello()))
+
+    def _no_place(self) -> str:
+        """Why there is no place for this client; empty where there is one."""
+        clients = self._server.clients
+        if len(clients) >= CLIENTS:
+            return f"{CLIENTS} clients are being served; close one"
+        if self.process and sum(one.process == self.process for one in clients) >= max(1, CLIENTS // 2):
+            return f"this program has {CLIENTS // 2} of the {CLIENTS} places; close one"
+        if self.process and sum(one.user == self.user for one in clients) >= most_of(CLIENTS):
+            return f"this user's programs have {most_of(CLIENTS)} of the {CLIENTS} places; close one"
+        return ""
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Remove the client and stop its timers."""

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from daemon.health.causes import cause_of
 from daemon.health.faults import FAULTS, Fault
 from daemon.maps.tiles import MapTiles
-from daemon.publish.stream.server import StreamServer
+from daemon.publish.stream.server import FaultInWords, StreamServer
 from daemon.runtime.cycle_facts import CycleFacts
 from daemon.runtime.vitals import process_age_s, resident_mb
 
@@ -58,9 +59,9 @@ class StreamBeat:
             self.tiles.forget()
 
 
-def in_words(faults: tuple[Fault, ...]) -> list[tuple[int, str, str]]:
-    """Number, meaning and remedy of each fault."""
-    return [(int(fault), *FAULTS[fault]) for fault in faults]
+def in_words(faults: tuple[Fault, ...]) -> list[FaultInWords]:
+    """Number, meaning and remedy of each fault, and the fault it follows from (0: none)."""
+    return [(int(fault), *FAULTS[fault], cause_of(fault, faults)) for fault in faults]
 
 
 def place_of(state: Callable[[], State | None], keyframe: int) -> tuple[float, float, float] | None:

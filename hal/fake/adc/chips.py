@@ -27,6 +27,8 @@ converter.
 
 T_ACQUIRE_S: Final = 1.12e-6
 """MCP3221: from the edge that starts a conversion to the opening of the sample switch."""
+_AIN1: Final = 5
+"""ADS1x15: multiplexer code of AIN1 against ground."""
 STALE_S: Final = 0.1
 """After this long without a conversion the first one is the sample from the end of the last transaction."""
 
@@ -152,6 +154,9 @@ class Ads1x15:
     Args:
         source: fractions of the supply ``supply_v``. bits: 16 for an ADS1115, 12 for an ADS1015.
         oscillator: relative error of its data rate, up to 0.1.
+
+    Attributes:
+        second_v: voltage at the input AIN1; None: as at the others.
     """
 
     acknowledges_data = True
@@ -163,6 +168,7 @@ class Ads1x15:
 
     def __init__(self, source: SampleSource, bits: int = 16, supply_v: float = 3.3, oscillator: float = 0.0) -> None:
         self._source, self._bits, self._supply_v, self._oscillator = source, bits, supply_v, oscillator
+        self.second_v: float | None = None
         self.power_on(0.0)
 
     def power_on(self, t_mono: float) -> None:
@@ -212,6 +218,8 @@ class Ads1x15:
         period = self._period()
         done = 1 if self.config & 0x0100 else math.floor((t_mono - self._since) / period)
         volts = float(self._source(np.array([self._since + (done - 0.5) * period]))[0]) * self._supply_v
+        if self.second_v is not None and self.config >> 12 & 7 == _AIN1:
+            volts = self.second_v
         steps = round(volts / self._FULL_SCALE[self.config >> 9 & 7] * 32768.0)
         value = min(max(steps, -32768), 32767)
         return (value & (0xFFF0 if self._bits == 12 else 0xFFFF)) & 0xFFFF

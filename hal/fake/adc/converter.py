@@ -6,6 +6,7 @@ virtual time and, behind :class:`hal.bus.i2c_server.BusServer`, a bus of this co
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from typing import Final
 
@@ -96,10 +97,10 @@ class FakeAdc:
         """Refuse an order that this receiver cannot carry out.
 
         Raises:
-            FaultError: ``dc_off`` without a DC channel, ``moved`` to the address of another chip.
+            FaultError: ``dc_off`` or ``foreign`` without a DC channel, ``moved`` to the address of another chip.
         """
-        if fault.what == "dc_off" and self._dc is None:
-            raise FaultError("dc_off", "this receiver has no DC channel")
+        if fault.what in ("dc_off", "foreign") and self._dc is None:
+            raise FaultError(fault.what, "this receiver has no DC channel")
         taken = {self.address} | ({self._dc[0]} if self._dc else set())
         if fault.what == "moved" and int(fault.number("address")) in taken:
             raise FaultError("moved.address", "there is a chip already")
@@ -113,6 +114,8 @@ class FakeAdc:
         if fault.what == "gone":
             self.unplugged += 1
         self._arrange()
+        if fault.what == "foreign":
+            self._write_foreign(fault)
 
     def end(self, fault: Fault) -> None:
         """A fault is lifted."""
@@ -120,6 +123,20 @@ class FakeAdc:
         self._arrange()
         if fault.what in ("off", "gone", "replaced"):
             self._power_on()
+
+    def _write_foreign(self, fault: Fault) -> None:
+        """Let the other program write its configuration to the DC channel's chip, now and again."""
+        chip = self._dc[1] if self._dc else None
+        if not isinstance(chip, Ads1x15):
+            return
+        if self.orders.on("foreign") is not fault:
+            chip.second_v = None
+            return
+        chip.second_v = fault.number("volts")
+        now = self._clock.now()
+        chip.write(b"\x01" + int(fault.number("config")).to_bytes(2, "big"), now)
+        chip.write(b"\x00", now)
+        asyncio.get_running_loop().call_later(fault.number("every_s"), self._write_foreign, fault)
 
     def _power_on(self) -> None:
         for chip in self.bus.chips.values():

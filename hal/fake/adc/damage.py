@@ -44,10 +44,23 @@ def _shift(data: bytes, fault: Fault, _random: Random) -> bytes:
     return (number & ((1 << 8 * len(data)) - 1)).to_bytes(len(data), "big")
 
 
+def _hit(data: bytes, fault: Fault, _random: Random) -> bytes:
+    """Invert bits of single words."""
+    count, mask = len(data) // 2, int(fault.number("mask"))
+    words = min(int(fault.number("words")), count)
+    out = bytearray(data)
+    for k in range(words):
+        at = 2 * (count * (2 * k + 1) // (2 * words))
+        out[at] ^= mask >> 8
+        out[at + 1] ^= mask & 0xFF
+    return bytes(out)
+
+
 DAMAGE: dict[str, Harm] = {
     "stuck": _stuck,
     "garbage": _garbage,
     "wrong": _wrong,
+    "hit": _hit,
     "shift": _shift,
     "released": _released,
     "floats": _floats,

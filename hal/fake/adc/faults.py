@@ -36,6 +36,15 @@ ADC: Vocabulary = {
     "replaced": Word("another chip answers at the address", "lasts", {"chip": Parameter("ADS1115", choices=CHIPS)}),
     "brownout": Word("the chip falls back into its reset state", "once"),
     "dc_off": Word("the DC channel's chip acknowledges nothing", "lasts"),
+    "foreign": Word(
+        "another program writes `config` to the DC channel's chip every `every_s`; its input AIN1 is at `volts`",
+        "lasts",
+        {
+            "config": Parameter(0x5283, 0, 0xFFFF),
+            "every_s": Parameter(0.1, 0.001, 3600.0),
+            "volts": Parameter(3.2, 0.0, 6.0),
+        },
+    ),
     # time
     "stall": Word(
         "SCL is held low for `us` at `pieces` places, the first at share `at` of the block (-1: anywhere)",
@@ -50,6 +59,11 @@ ADC: Vocabulary = {
     "released": Word("the chip lets go at share `at` of the block", "strikes", {"at": Parameter(0.5, 0.0, 1.0)}),
     "floats": Word("every bit reads 1", "strikes"),
     "shift": Word("`bits` clocks too few: everything is shifted", "strikes", {"bits": Parameter(1, 1, 15)}),
+    "hit": Word(
+        "bits `mask` of `words` words, evenly spread over the block, are inverted",
+        "strikes",
+        {"words": Parameter(1, 1, 1000), "mask": Parameter(0x8000, 1, 0xFFFF)},
+    ),
     # light
     "clip": Word(
         "the signal is `gain` times as large, and the amplifier stops `stop` of the supply short of either rail",

@@ -101,6 +101,12 @@ class Console:
         request = parse(line, device.model)
         if isinstance(request, Refusal):
             return self._reply(line, request.status)
+        denied = device.orders.strike("denied", command=request.name)
+        if denied:
+            return self._reply(line, denied.text("status"))
+        unready = device.not_ready() if request.name in STREAMS | SINGLES else None
+        if unready:
+            return self._reply(line, unready.text("status"))
         cell = response(device.model.profile, device.state, request.name, request.parameters)
         if cell == "--":
             return self._done()
@@ -128,18 +134,29 @@ class Console:
             return scip_encoder.summed_line(device.state.value.encode("ascii"))
         if name == "VV":
             pairs = info_replies.identity(device.model, device.unit, ";beta" if device.orders.on("semicolon") else "")
+            vendor = device.orders.on("vendor")
+            pairs = [(key, vendor.text("text") if vendor and key == "VEND" else value) for key, value in pairs]
         elif name == "PP":
             fault = device.orders.on("dmax")
             pairs = info_replies.parameters(device.model, int(fault.number("value")) if fault else device.model.dmax)
+            pairs = [(key, self._stated(key, value)) for key, value in pairs]
         else:
             pairs = info_replies.state(device.model, self._live())
         return info_replies.lines(pairs, line)
+
+    def _stated(self, key: str, value: str) -> str:
+        """The value that PP gives for a key."""
+        fault = self._device.orders.on("parameter")
+        return fault.text("value") if fault and fault.text("key") == key else value
 
     def _live(self) -> info_replies.LiveState:
         device = self._device
         fault = device.orders.on("trouble")
         trouble = fault.text("text") if fault else device.trouble
-        return info_replies.LiveState(device.state, device.laser, device.baud, device.clock.tick(device.now()), trouble)
+        unready = device.not_ready()
+        mode = unready.text("mode") if unready else ""
+        tick = device.clock.tick(device.now())
+        return info_replies.LiveState(device.state, device.laser, device.baud, tick, trouble, mode)
 
     def _time(self, request: Request) -> None:
         device = self._device

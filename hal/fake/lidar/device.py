@@ -157,6 +157,7 @@ class FakeHokuyo:
         """Start up: clock at zero, BOOTING, then IDLE (or SCIP 1.1); USB and Ethernet drop the connection meanwhile."""
         device = self._device
         self._power_off()
+        device.started = device.now()
         late = device.orders.on("boot_delay")
         boot_s = self.model.boot_s + (late.number("by_s") if late else 0.0)
         device.ready_at = device.now() + max(self.unit.spin_up_s, boot_s)
@@ -253,6 +254,7 @@ class FakeHokuyo:
             "scip1": (lambda _: self._fall_back(), _nothing),
             "set_clock": (lambda f: device.clock.set(device.now(), f.number("ms")), _nothing),
             "error": (self._fail, _nothing),
+            "not_ready": (self._start_late, _nothing),
         }
 
     def _turn_off(self, _fault: Fault) -> None:
@@ -271,6 +273,10 @@ class FakeHokuyo:
     def _verified(self) -> None:
         self._head.report("98")
         self._head.resume()
+
+    def _start_late(self, _fault: Fault) -> None:
+        """The sensor has started just now."""
+        self._device.started = self._device.now()
 
     def _fall_back(self) -> None:
         if self.state is not State.BOOTING:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 from random import Random
 
+from hal.fake.faults.orders import Fault
 from hal.fake.faults.schedule import ActiveFaults
 from hal.fake.lidar.damage import DAMAGE, splice
 from hal.fake.lidar.dialect_grid import State
@@ -23,7 +25,7 @@ class DeviceState:
     Attributes:
         clock: the 24-bit clock. output: the line to the host. orders: faults in force.
         state, laser, baud: present mode, laser state and line rate. ready_at: time from which the motor turns.
-        trouble: replaces the health text of II.
+        trouble: replaces the health text of II. started: time of the latest start.
     """
 
     def __init__(self, model: LidarModel, unit: Unit, loop: asyncio.AbstractEventLoop) -> None:
@@ -37,6 +39,7 @@ class DeviceState:
         self.laser = False
         self.laser_since = self.ready_at = loop.time()
         self.trouble = ""
+        self.started = -math.inf
         self.foreign: Callable[[str], bytes] = lambda _command: b""
         self._timers: dict[str, asyncio.TimerHandle] = {}
 
@@ -59,6 +62,11 @@ class DeviceState:
         for timer in self._timers.values():
             timer.cancel()
         self._timers.clear()
+
+    def not_ready(self) -> Fault | None:
+        """The fault by which the sensor does not measure yet after its start; None where it measures."""
+        fault = self.orders.on("not_ready")
+        return fault if fault and self.now() < self.started + fault.number("by_s") else None
 
     def line_rate(self) -> float:
         """Bytes per second of the line."""

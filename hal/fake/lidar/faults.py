@@ -10,6 +10,8 @@ from hal.fake.lidar.scip_encoder import MAX_3
 ON = {"on": Parameter("scans", choices=("scans", "replies", "all"))}
 COMMANDS = tuple(sorted({*PARAMETERS, *STREAMS, *SINGLES, "SC"}))
 """As returned by `hal.fake.lidar.commands.letters`; SC is ``SCIP2.0``."""
+REFUSALS = ("0E", "10", "0M", "0L", "0A", "0C", "0F")
+PP_KEYS = ("MODL", "DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")
 
 LIDAR: Vocabulary = {
     # the general words
@@ -69,10 +71,30 @@ LIDAR: Vocabulary = {
     "no_reply": Word(
         "`command` is obeyed but its acknowledgement is lost", "strikes", {"command": Parameter("MD", choices=COMMANDS)}
     ),
+    "denied": Word(
+        "`command` is answered `status`, and not carried out",
+        "strikes",
+        {"command": Parameter("VV", choices=COMMANDS), "status": Parameter("0E", choices=REFUSALS)},
+    ),
+    "not_ready": Word(
+        "for `by_s` after each start, no measurement: answered `status`; `mode` is then the mode of II",
+        "lasts",
+        {
+            "by_s": Parameter(30.0, 0.0, 3600.0),
+            "status": Parameter("0M", choices=REFUSALS),
+            "mode": Parameter(""),
+        },
+    ),
     "text_sum": Word(
         "text lines are summed with the semicolon (`whole`) or up to `<-` (`mark`)",
         "lasts",
         {"variant": Parameter("whole", choices=("whole", "mark"))},
+    ),
+    "vendor": Word("the vendor's name in VV is `text`, in Latin-1", "lasts", {"text": Parameter("H\xf6kuy\xf6")}),
+    "parameter": Word(
+        "PP gives `value` for `key`",
+        "lasts",
+        {"key": Parameter("SCAN", choices=PP_KEYS), "value": Parameter("2400[rpm]")},
     ),
     "semicolon": Word("the firmware text holds a semicolon", "lasts"),
     "dmax": Word("PP reports another DMAX", "lasts", {"value": Parameter(MAX_3, 1)}),

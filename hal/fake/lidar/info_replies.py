@@ -16,13 +16,14 @@ SPEEDS = {"usb": "USB Full Speed", "ethernet": "Ethernet 100[Mbps]"}
 
 @dataclass(slots=True)
 class LiveState:
-    """Values of II that change at run time. ``trouble`` replaces the health text."""
+    """Values of II that change at run time. ``trouble`` and ``mode`` replace the health and the mode text."""
 
     state: State
     laser: bool
     baud: int
     tick: int
     trouble: str = ""
+    mode: str = ""
 
 
 def identity(model: LidarModel, unit: Unit, suffix: str = "") -> Lines:
@@ -59,7 +60,7 @@ def state(model: LidarModel, live: LiveState) -> Lines:
         ("MODL", model.modl),
         ("LASR", "ON" if live.laser else "OFF"),
         ("SCSP", f"Initial({model.rpm}[rpm])<-Default setting by user"),
-        ("MESM", model.modes[mode]),
+        ("MESM", live.mode or model.modes[mode]),
         ("SBPS", link),
         ("TIME", f"{live.tick:06X}"),
         ("STAT", live.trouble or model.stat),

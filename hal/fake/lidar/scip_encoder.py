@@ -63,20 +63,20 @@ def summed_line(payload: bytes) -> bytes:
 
 
 def text_line(key: str, value: str) -> bytes:
-    """A ``KEY:value;s`` line of VV, PP and II; the semicolon is not summed."""
-    text = f"{key}:{value}".encode("ascii")
+    """A ``KEY:value;s`` line of VV, PP and II, in Latin-1; the semicolon is not summed."""
+    text = f"{key}:{value}".encode("latin-1")
     return text + b";" + checksum(text) + b"\n"
 
 
 def text_line_summed_whole(key: str, value: str) -> bytes:
     """A firmware variant: the semicolon is summed, too."""
-    text = f"{key}:{value};".encode("ascii")
+    text = f"{key}:{value};".encode("latin-1")
     return text + checksum(text) + b"\n"
 
 
 def text_line_summed_to_mark(key: str, value: str) -> bytes:
     """A variant of UTM-30LX firmware: ``value<-remark`` is summed up to and including ``<-``."""
-    text = f"{key}:{value}".encode("ascii")
+    text = f"{key}:{value}".encode("latin-1")
     mark = text.find(b"<-")
     summed = text[: mark + 2] if mark >= 0 else text
     return text + b";" + checksum(summed) + b"\n"

@@ -59,10 +59,19 @@ export class Panel {
     const key = JSON.stringify(list);
     if (this.faultsShown === key) return;
     this.faultsShown = key;
-    const items = list.map(({ fault, meaning, remedy }) => {
+    const line = ({ fault, meaning, remedy }) => {
       const item = element("li"), what = element("span", "remedy");
       what.append(...marked(remedy));
       item.append(element("b", "", `${fault} `), ...marked(meaning), what);
+      return item;
+    };
+    const items = list.filter((one) => !one.cause).map((one) => {
+      const item = line(one), follow = list.filter(({ cause }) => cause === one.fault);
+      if (follow.length) {
+        const below = element("ul", "follows");
+        below.append(...follow.map((each) => line({ ...each, remedy: "" })));
+        item.append(below);
+      }
       return item;
     });
     const rest = items.splice(FAULTS), more = element("details");

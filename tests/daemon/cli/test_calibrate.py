@@ -12,7 +12,7 @@ import pytest
 
 import daemon.cli.calibrate
 import daemon.cli.survey
-from daemon.cli import parser
+from daemon.cli import inputs, parser
 from daemon.commissioning.teach_drive import Drive, heard, poses_at
 from daemon.config.loader import load
 from daemon.config.residual_file import ResidualError, read_residuals, write_residuals
@@ -56,6 +56,15 @@ def taught() -> Drive:
     wheels = np.column_stack((T0 + t, 0.98 * there[:, :2], np.unwrap(there[:, 2])))
     drive.readings = wheels
     return drive
+
+
+@pytest.fixture(autouse=True)
+def there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording called ``teach`` can be opened."""
+    opened = inputs.log
+    monkeypatch.setattr(
+        inputs, "log", lambda args: setattr(args, "source", None) if args.log == Path("teach") else opened(args)
+    )
 
 
 @pytest.fixture

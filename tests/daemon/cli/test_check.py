@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from daemon.cli import parser
 from daemon.diagnosis import map_folder
 from daemon.maps.store import Store
 from daemon.system import console
+from daemon.system.folder_lock import FolderLock
 from tests.daemon.support.map_maker import Shape, content
 
 SURVEY = """
@@ -186,19 +186,21 @@ def test_the_folder_of_maps_is_looked_at(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_lock_of_the_same_number_on_another_disk_is_another_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lock, listed = tmp_path / "lock", tmp_path / "locks"
-    lock.touch()
-    about = lock.stat()
+    folder, listed = tmp_path / "maps", tmp_path / "locks"
+    folder.mkdir()
+    about = folder.stat()
     line = "1: FLOCK  ADVISORY  WRITE {} {:02x}:{:02x}:{} 0 EOF\n"
     place = (os.major(about.st_dev), os.minor(about.st_dev))
     foreign = line.format(11, place[0] + 1, place[1], about.st_ino)
     monkeypatch.setattr(map_folder, "LOCKS", listed)
-    with lock.open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        listed.write_text(foreign)
-        assert map_folder._keeper(lock) == "another process"
-        listed.write_text(foreign + line.format(22, *place, about.st_ino))
-        assert map_folder._keeper(lock) == "process 22"
+    lock = FolderLock(folder)
+    lock.take()
+    listed.write_text(foreign)
+    assert map_folder._keeper(folder) == "another process"
+    listed.write_text(foreign + line.format(22, *place, about.st_ino))
+    assert map_folder._keeper(folder) == "process 22"
+    lock.close()
+    assert map_folder._keeper(folder) == ""
 
 
 def test_a_folder_that_another_daemon_has_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -218,5 +220,5 @@ def test_a_folder_that_another_daemon_has_is_said(tmp_path: Path, capsys: pytest
     assert "fault 403" not in said("--set", "map.localise=true"), "nothing is kept then"
     other.close()
     assert "fault 403" not in said()
-    (maps / "lock").chmod(0o444)
+    maps.chmod(0o555)
     assert ("fault 403" in said()) is (os.geteuid() != 0), "root may write everywhere"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli import parser
+from daemon.cli import inputs, parser
 from daemon.config.paths import maps_folder
 from daemon.config.schema import Config
 from daemon.system import console
@@ -85,6 +85,7 @@ def _command(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> li
     module = types.ModuleType("daemon.cli.replay")
     module.main = body  # type: ignore[attr-defined]  # a module made for this test
     monkeypatch.setitem(sys.modules, "daemon.cli.replay", module)
+    monkeypatch.setattr(inputs, "log", lambda args: None)
     return seen
 
 

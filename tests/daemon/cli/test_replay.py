@@ -14,6 +14,7 @@ import pytest
 from daemon.app import Daemon, Environment
 from daemon.cli import parser
 from daemon.config.schema import Config, ModbusConfig
+from daemon.replay.results import Trajectory
 from daemon.runtime import warmup
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.cycle_parts import CycleRecord
@@ -216,6 +217,19 @@ def test_a_missing_log_and_an_output_that_is_a_file(
     (tmp_path / "file").write_text("")
     assert parser.main(["replay", str(log), "--out", str(tmp_path / "file")]) == console.FAILED
     assert "is a file; name a folder" in capsys.readouterr().err
+
+
+def test_a_log_that_is_mostly_guessed_says_so_in_its_last_line(
+    tmp_path: Path, log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lost(told: Trajectory) -> list[str]:
+        return ["LOST" if number < 0.3 * len(told.stamps) else "" for number in range(len(told.stamps))]
+
+    monkeypatch.setattr(Trajectory, "guesses", lost)
+    assert parser.main(["replay", str(log), "--out", str(tmp_path)]) == console.OK
+    assert "30 % of the poses are guesses: do not rely on" in capsys.readouterr().err.splitlines()[-1]
+    counts = summary_of(tmp_path)["counts"]
+    assert counts["guesses"] == pytest.approx(0.3 * float(str(counts["poses"])), abs=1.0)
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,11 @@ from pathlib import Path
 import pytest
 
 from daemon.cli.doctor import examine
+from daemon.config.schema import PhotodiodeConfig
 from daemon.diagnosis.host import Heard, Host, Mute
 from daemon.maps.store import Store
 from daemon.publish.stream.messages import Fault, Faults, Pose
+from daemon.runtime.warmup import CannotLoad, Warmth
 from daemon.system import console
 from hal.errors import DeviceFault
 from hal.hokuyo.probe import Finding
@@ -46,8 +48,9 @@ class Computer(Host):
     follows: bool | None = True
     room: int = 10 << 30
     ports: dict[int, int] = field(default_factory=dict)
-    compiled: bool = True
+    warmth: Warmth | None = field(default_factory=lambda: Warmth(False, 0.8))
     no_cache: str = ""
+    warmed_for: PhotodiodeConfig | None = None
     rights: bool = True
 
     def utc(self) -> float:
@@ -83,10 +86,11 @@ class Computer(Host):
     def resolved(self, host: str) -> str:
         return "Name or service not known" if host == "nohost" else ""
 
-    def warm(self, lights: bool) -> bool:
+    def warm(self, photodiode: PhotodiodeConfig) -> Warmth | None:
+        self.warmed_for = photodiode
         if self.no_cache:
-            raise RuntimeError(self.no_cache)
-        return self.compiled
+            raise CannotLoad(self.no_cache)
+        return self.warmth
 
     def realtime(self) -> bool:
         return self.rights
@@ -108,8 +112,10 @@ def asked(file: Path | None, host: Host, *words: str, as_json: bool = False) -> 
 
 
 def test_where_all_is_well_nothing_has_to_be_fixed(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert asked(file, Computer()) == console.OK
+    computer = Computer()
+    assert asked(file, computer) == console.OK
     said = capsys.readouterr().out
+    assert computer.warmed_for == PhotodiodeConfig(bus=BUS)
     assert said.endswith("nothing has to be fixed\n")
     assert "FIX" not in said
     assert re.search(r"good +lidar +/dev/ttyACM0: UTM-30LX", said)
@@ -180,6 +186,10 @@ CASES = {
         "odometry.port",
     ),
     "no cache": (broken(no_cache="no writable directory"), "kernels", "no writable directory", "a folder of its own"),
+    "kernels not stored": (
+        broken(warmth=Warmth(True, 60.0, damaged=1, unwritten="/c/k: Read-only file system")),
+        *("kernels", "/c/k: Read-only file system; each start compiles them", "NUMBA_CACHE_DIR"),
+    ),
     "a fault of the daemon": (broken(heard=FAULTY), "daemon", "fault 104: no valid scan", "check the cable"),
     "not heard": (broken(heard=Mute("may not listen", "usermod")), "daemon", "may not listen", "usermod"),
     "no pose": (broken(heard=Heard("agv", 7)), "daemon", "tells no pose", "see its log"),
@@ -212,7 +222,8 @@ def test_a_lamp_that_is_missing_is_not_in_view(file: Path, capsys: pytest.Captur
 
 
 REMARKS = {
-    "cold": (broken(compiled=False), "kernels", "lumiloop warm"),
+    "cold": (broken(warmth=None), "kernels", "lumiloop warm"),
+    "kernels damaged": (broken(warmth=Warmth(True, 3.0, damaged=2)), "kernels", "the disk is failing"),
     "not synchronised": (broken(follows=False), "clock", "timedatectl"),
     "no real time": (broken(rights=False), "real time", "LimitRTPRIO"),
     "not running": (broken(), "lamps", "start it"),
@@ -367,3 +378,13 @@ def test_a_lamp_in_a_passing_shadow_is_nothing_to_fix(file: Path, capsys: pytest
     said = capsys.readouterr().out
     assert not re.search(r"FIX +lamps", said)
     assert "at this moment" in said
+
+
+def test_what_follows_from_a_fault_is_no_second_thing_to_fix(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    slow = Fault(fault=306, meaning="too slow", remedy="take load off")
+    stalled = Fault(fault=301, meaning="stalled", remedy="take load off", cause=306)
+    asked(file, Computer(heard=Heard("agv", 7, POSE, Faults(present=(slow, stalled)))))
+    said = capsys.readouterr().out
+    assert re.search(r"FIX +daemon +fault 306: too slow", said)
+    assert re.search(r"note +daemon +fault 301 follows from fault 306: stalled", said)
+    assert said.count("take load off") == 1 + said.endswith("daemon: take load off\n")

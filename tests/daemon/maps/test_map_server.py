@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from daemon.maps.grey_image import BadPicture, Picture, read_picture
 from daemon.maps.map_server import BadMapServer, cells_of, describe, load
+from daemon.maps.map_server.picture import read_picture
+from daemon.maps.map_server.pixels import BadPicture, Picture
 
 YAML = (
     "image: map.pgm\nresolution: 0.05\norigin: [-1.0, 2.0, 0.5]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
@@ -95,7 +96,12 @@ def test_plain_pgm_and_comments() -> None:
 @pytest.mark.parametrize(
     ("data", "says"),
     [
-        (b"GIF89a", "neither PGM nor PNG"),
+        (b"MZ\x90", "neither PGM, PNG, BMP, JPEG, TIFF nor GIF"),
+        (b"GIF89a", "neither PGM, PNG, BMP, JPEG, TIFF nor GIF"),
+        (b"P5\n1234567890 1\n255\n", "a number that is too large"),
+        (b"P2\n2 1\n255\n0 -1", "something else than whole numbers"),
+        (b"P2\n2 1\n255\n", "ends after 0 of its 2 pixels"),
+        (b"P2\n1 1\n255\n99999999999999999999999", "beyond its largest"),
         (b"P5 3", "its head is not that of a PGM"),
         (b"P5\n3 2\n255\n12345", "ends after 5 of its 6 pixels"),
         (b"P5\n30000 20000\n255\n", "30000 x 20000 pixels"),
@@ -120,19 +126,19 @@ def test_a_png_that_is_cut_off_or_damaged(tmp_path: Path) -> None:
             read_picture(data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :], MOST)
 
 
-def cells(mode: str, grey: object, alpha: object = None, negate: int = 0) -> list[list[int]]:
+def cells_in(mode: str, grey: object, alpha: object = None, negate: int = 0) -> list[list[int]]:
     told = describe(HERE, YAML.replace("negate: 0", f"negate: {negate}") + f"mode: {mode}\n")
-    shades = np.atleast_2d(np.array(grey, dtype=np.float64)) / 255.0
-    clear = None if alpha is None else np.atleast_2d(np.array(alpha, dtype=np.float64)) / 255.0
-    return cells_of(told, Picture(shades, clear)).tolist()
+    layers = [np.atleast_2d(np.array(layer, np.uint8)) for layer in (grey, alpha) if layer is not None]
+    return cells_of(told, Picture(np.stack(layers, axis=2), 255, transparent=alpha is not None)).tolist()
 
 
 def test_the_rules_of_each_mode() -> None:
-    assert cells("trinary", GREYS) == [[-1, 1, 0], [1, 0, -1]]  # bottom row first; 100: p 0.61, 88: 0.655
-    assert cells("trinary", GREYS, negate=1) == [[-1, -1, 1], [0, 1, 1]]
-    assert cells("scale", [0, 254, 0], alpha=[255, 255, 128]) == [[1, 0, -1]]
-    assert cells("trinary", [0, 254], alpha=[255, 255]) == [[-1, 0]]  # transparency counts as a colour there
-    assert cells("raw", [100, 0, 255, 50]) == [[1, 0, -1, -1]]
+    assert cells_in("trinary", GREYS) == [[-1, 1, 0], [1, 0, -1]]  # bottom row first; 100: p 0.61, 88: 0.655
+    assert cells_in("trinary", GREYS, negate=1) == [[-1, -1, 1], [0, 1, 1]]
+    assert cells_in("scale", [0, 254, 0], alpha=[255, 255, 128]) == [[1, 0, -1]]
+    # opacity counts as a fourth colour there, as nav2 does it: black is 1 - 1/4 occupied, half transparent white 1/8
+    assert cells_in("trinary", [0, 254, 254], alpha=[255, 255, 0]) == [[1, 0, -1]]
+    assert cells_in("raw", [100, 0, 255, 50]) == [[1, 0, -1, -1]]
 
 
 def test_a_map_of_two_files(tmp_path: Path) -> None:

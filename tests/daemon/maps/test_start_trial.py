@@ -15,7 +15,7 @@ from daemon.app import Daemon, Environment, Pacemaker
 from daemon.config.schema import MapConfig
 from daemon.maps import autosave, start_trial
 from daemon.maps.initial_state import started
-from daemon.maps.start_trial import MOST, NAME, PROOF_S
+from daemon.maps.start_trial import BOOT, MOST, NAME, PROOF_S
 from daemon.maps.store import Start
 from daemon.runtime import estimator_runner
 from daemon.runtime.warmup import CannotLoad
@@ -25,6 +25,7 @@ from tests.daemon.maps.autosave_bench import Bench
 from tests.daemon.maps.test_store import name, names, store_with
 from tests.daemon.scenarios.test_daemon import SETTINGS
 from tests.daemon.support.map_maker import Shape, content
+from tests.daemon.support.odd_files import KINDS, planted
 
 
 def begin(folder: Path, lasts: bool = False, ends: bool = False) -> Start | None:
@@ -201,12 +202,42 @@ def test_another_run_of_the_computer_counts_anew(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize(
-    "held", [b"", b"\xff", b"rubbish", b"[]", b"{}", b'{"boot": "-", "of": 1, "count": "x", "out": []}']
+    "held",
+    [
+        *(b"", b"\xff", b"rubbish", b"[]", b"{}", b'{"boot": "-", "of": 1, "count": "x", "out": []}'),
+        *(b"[" * 100_000, b'{"out": ' + b"[" * 100_000, b'{"a": ' * 100_000, b" " * (1 << 20) + b"{}"),
+        *(b'{"boot": "BOOT", "count": %s}' % number for number in (b"1e999", b"-1", b"9" * 5000, b"NaN", b"null")),
+        *(b'{"boot": "BOOT", "out": ["%s"]}' % path for path in (b"", b".", b"../x.lumimap", b"a/b.lumimap", b"lock")),
+        b'{"boot": "BOOT", "out": [["a"], null]}',
+    ],
+    ids=lambda held: repr(held[:40]),
 )
 def test_a_count_that_cannot_be_read_is_none(tmp_path: Path, held: bytes) -> None:
     store_with(tmp_path, 1).close()
-    (tmp_path / NAME).write_bytes(held)
+    (tmp_path / NAME).write_bytes(held.replace(b"BOOT", BOOT.read_bytes().strip()))
+    before = names(tmp_path)
+    assert begin(tmp_path, lasts=True) is not None
+    assert names(tmp_path) == before
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_count_that_is_no_regular_file_is_none(tmp_path: Path, kind: str) -> None:
+    store_with(tmp_path, 1).close()
+    planted(tmp_path / NAME, kind)
     assert begin(tmp_path) is not None
+
+
+def test_a_map_whose_name_is_no_text_is_left_out_like_any_other(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Linux takes any bytes for a name."""
+    caplog.set_level(
+        logging.CRITICAL, "daemon.maps.store"
+    )  # lines with the name: no report of a worker may contain them
+    (tmp_path / os.fsdecode(b"\xff\xfe.lumimap")).write_bytes(content(seed=1))
+    for _ in range(MOST):
+        assert begin(tmp_path) is not None
+    assert begin(tmp_path) is None
 
 
 def test_a_folder_that_cannot_be_written_counts_nothing(tmp_path: Path) -> None:

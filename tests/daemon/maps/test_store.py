@@ -11,9 +11,10 @@ import pytest
 from daemon.config.schema import MapConfig
 from daemon.devices.light_setup import Lights
 from daemon.maps.container import Damaged
+from daemon.maps.generations import NEWEST, OTHERS
 from daemon.maps.initial_state import NoMap, new_state, recorded_start, started
 from daemon.maps.schema import digest_of
-from daemon.maps.store import NEWEST, OTHERS, Store
+from daemon.maps.store import Store
 from estimator.cdma.air_interface import PROFILE_A
 from estimator.light_filter.survey import Survey
 from tests.daemon.support.map_maker import LAMPS, SURVEY, Shape, content

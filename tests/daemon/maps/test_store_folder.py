@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import logging
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -25,6 +27,71 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
     with pytest.raises(BlockingIOError) as caught:
         Store(tmp_path).save(content(), MAP)
     assert "another process" in generations.said(caught.value)
+    first.close()
+    Store(tmp_path).save(content(), MAP)
+
+
+def test_deleting_all_files_of_a_folder_leaves_its_lock(tmp_path: Path) -> None:
+    first = store_with(tmp_path, 1)
+    for path in tmp_path.iterdir():
+        path.unlink()
+    with pytest.raises(BlockingIOError):
+        Store(tmp_path).save(content(), MAP)
+    first.save(content(), MAP)
+
+
+def made_anew(folder: Path) -> None:
+    folder.rename(folder.with_name("away"))
+    folder.mkdir()
+
+
+def test_a_folder_that_was_made_anew_has_a_lock_of_its_own(tmp_path: Path) -> None:
+    folder = tmp_path / "maps"
+    first = store_with(folder, 1)
+    made_anew(folder)
+    second = Store(folder)
+    second.save(content(seed=2), MAP)
+    with pytest.raises(BlockingIOError):
+        first.save(content(seed=3), MAP)
+    first.claim()
+    assert "another process keeps its maps there" in first.trouble
+    second.close()
+    first.claim()
+    assert first.trouble == ""
+    with pytest.raises(BlockingIOError):
+        second.save(content(seed=4), MAP)
+
+
+def test_who_locked_a_folder_locks_the_one_in_its_place(tmp_path: Path) -> None:
+    folder = tmp_path / "maps"
+    first = store_with(folder, 1)
+    made_anew(folder)
+    first.save(content(seed=2), MAP)
+    with pytest.raises(BlockingIOError):
+        Store(folder).save(content(seed=3), MAP)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_is_said_at_the_start(tmp_path: Path) -> None:
+    tmp_path.chmod(0o555)
+    store = Store(tmp_path)
+    store.claim()
+    assert store.trouble.endswith("Permission denied")
+
+
+def test_a_disk_without_locks_on_folders_locks_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As NFS, which locks only what is open for writing."""
+    flock = fcntl.flock
+
+    def nfs(handle: int, kind: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        flock(handle, kind)
+
+    monkeypatch.setattr(fcntl, "flock", nfs)
+    first = store_with(tmp_path, 1)
+    with pytest.raises(BlockingIOError):
+        Store(tmp_path).save(content(), MAP)
     first.close()
     Store(tmp_path).save(content(), MAP)
 

@@ -115,8 +115,8 @@ def taken_port() -> socket.socket:
 class Wire(asyncio.Transport):
     """A connection's transport without a network."""
 
-    def __init__(self, protocol: asyncio.Protocol) -> None:
-        super().__init__()
+    def __init__(self, protocol: asyncio.Protocol, host: str = "") -> None:
+        super().__init__({"peername": (host, 5000)} if host else None)
         self._protocol = protocol
         self.sent = bytearray()
         self.gone = False
@@ -147,8 +147,9 @@ class Wire(asyncio.Transport):
     abort = close
 
 
-def plugged(endpoint: tcp_endpoint.TcpEndpoint) -> tuple[tcp_endpoint.Connection, Wire]:
+def plugged(endpoint: tcp_endpoint.TcpEndpoint, host: str = "") -> tuple[tcp_endpoint.Connection, Wire]:
+    """A connection, from this address, on a transport without a network."""
     connection = tcp_endpoint.Connection(endpoint)
-    wire = Wire(connection)
+    wire = Wire(connection, host)
     connection.connection_made(wire)
     return connection, wire

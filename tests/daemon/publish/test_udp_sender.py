@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import logging
 import socket
+import sys
 from typing import Any
 
 import pytest
 
+from daemon.config import endpoints
 from daemon.publish import udp_sender
 from daemon.publish.modbus import registers
 from daemon.publish.udp_sender import PoseSender
 from hal.clock import run_virtual
 from hal.errors import DeviceMissing
 from hal.net import inet
+from hal.net.interfaces import interface_of
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import until
 
@@ -140,7 +144,7 @@ def test_what_the_kernel_does_not_take_is_dropped_and_said_once(caplog: pytest.L
     async def run() -> PoseSender:
         sender = PoseSender(["192.0.2.1:15020"])
         await sender.start()
-        sender._sockets[socket.AF_INET, 0] = Failing(errors)  # type: ignore[assignment]  # all that is asked of a socket
+        sender._sockets[socket.AF_INET, ""] = Failing(errors)  # type: ignore[assignment]  # all that is asked of a socket
         for _ in range(6):
             sender.publish(snapshot())
             failing.append(sender.failing)
@@ -214,9 +218,88 @@ async def test_a_group_of_a_named_network_interface_is_sent_to_by_that() -> None
         (socket.AF_INET6, ("fe80::1", 5000, 0, LOOPBACK)),
         (socket.AF_INET6, ("ff15::42", 5000)),
     ]
-    for interface in (LOOPBACK, 0):
+    for interface in (LOOPBACK, ""):
         with sender._open(socket.AF_INET6, interface) as sock:
-            assert sock.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF) == interface
+            assert sock.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF) == (interface or 0)
+    await sender.close()
+
+
+def own_addresses() -> list[str]:
+    """Addresses of this computer's first interface but loopback that can have groups."""
+    found = []
+    for family, far in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
+        with socket.socket(family, socket.SOCK_DGRAM) as sock, contextlib.suppress(OSError):
+            sock.connect((far, 9))
+            found.append(str(sock.getsockname()[0]))
+    return found
+
+
+def heard(group: str, bind: str, interface: int) -> bytes:
+    """What a member of the group on one interface receives of a snapshot that is sent with this `bind`."""
+    v4 = ":" not in group
+    with socket.socket(socket.AF_INET if v4 else socket.AF_INET6, socket.SOCK_DGRAM) as sock:
+        sock.bind((group, 0))
+        if v4:
+            member = socket.inet_aton(group) + bytes(4) + interface.to_bytes(4, sys.byteorder)
+            sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        else:
+            member = socket.inet_pton(socket.AF_INET6, group) + interface.to_bytes(4, sys.byteorder)
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, member)
+        sock.settimeout(0.3)
+        port = sock.getsockname()[1]
+
+        async def send() -> None:
+            sender = PoseSender([f"{group}:{port}" if v4 else f"[{group}]:{port}"], endpoints.interface_of(bind))
+            await sender.start()
+            sender.publish(snapshot(seq=7))
+            await sender.close()
+
+        asyncio.run(send())
+        with contextlib.suppress(TimeoutError):
+            return sock.recv(512)
+        return b""
+
+
+@pytest.mark.parametrize("group", ["239.255.0.7", "ff15::42"])
+def test_a_group_is_sent_to_by_the_interface_whose_address_bind_is(group: str) -> None:
+    addresses = own_addresses()
+    if not addresses or (":" in group and not any(":" in one for one in addresses)):
+        pytest.skip("this computer has no network beside loopback")
+    for bind in addresses:
+        index = interface_of(bind)
+        assert index != LOOPBACK
+        assert registers.decode_datagram(heard(group, bind, index))["seq"] == 7
+        if ":" not in group:
+            assert not heard(group, bind, LOOPBACK)
+
+
+def test_a_group_stays_on_this_computer_with_the_loopback_address_as_bind() -> None:
+    assert registers.decode_datagram(heard("239.255.0.7", "127.0.0.1", LOOPBACK))["seq"] == 7
+    for bind in own_addresses():
+        assert not heard("239.255.0.7", "127.0.0.1", interface_of(bind))
+
+
+@pytest.mark.parametrize("bind", ["0.0.0.0", "::"])
+def test_with_all_addresses_the_route_names_the_interface(bind: str) -> None:
+    assert endpoints.interface_of(bind) == ""
+
+
+def test_an_address_that_this_computer_does_not_have_is_an_error() -> None:
+    for address in ("203.0.113.9", "2001:db8::9"):
+        with pytest.raises(OSError, match="assign"):
+            interface_of(address)
+    assert interface_of("127.0.0.1") == interface_of("127.8.0.1") == interface_of("::1") == LOOPBACK
+
+
+async def test_an_interface_that_comes_back_with_another_number_is_found_again() -> None:
+    sender = PoseSender(["239.255.0.7:5600"], "127.0.0.1")
+    await sender.start()
+    sender.publish(snapshot(seq=7))
+    (broken,) = sender._sockets.values()
+    broken.close()
+    sender.publish(snapshot(seq=8))
+    sender.publish(snapshot(seq=8))
+    assert (sender.receivers[0].sent, sender.receivers[0].dropped, sender.failing) == (2, 1, False)
     await sender.close()
 
 

@@ -35,7 +35,7 @@ PEER = ("192.0.2.7", 4000)
 
 
 def ask(leases: Leases, now: float, lease: int = 10, peer: object = PEER, cookie: int = 0) -> Message:
-    answer = leases.answer(peer, Message(Status.ASK, lease, cookie), now)
+    answer = leases.answer((peer, ()), Message(Status.ASK, lease, cookie), now)
     assert answer is not None
     return answer
 
@@ -76,9 +76,9 @@ def test_a_lease_is_granted_renewed_ended_and_runs_out() -> None:
     leases = Leases()
     granted = subscribe(leases, 0.0)
     assert (granted.status, granted.lease) == (Status.GRANTED, 10)
-    assert leases.peers(9.9) == [PEER]
+    assert leases.peers(9.9) == [(PEER, ())]
     assert ask(leases, 9.9, 10, PEER, granted.cookie).status is Status.GRANTED
-    assert leases.peers(19.8) == [PEER]
+    assert leases.peers(19.8) == [(PEER, ())]
     assert leases.peers(19.9) == []
     assert subscribe(leases, 30.0, lease=65_535).lease == LONGEST_LEASE_S
     assert ask(leases, 31.0, 0, PEER, granted.cookie).status is Status.ENDED
@@ -105,17 +105,27 @@ def test_the_answer_to_a_stranger_is_no_larger_than_the_question() -> None:
 
 def test_answers_are_not_answered() -> None:
     for status in set(Status) - {Status.ASK}:
-        assert Leases().answer(PEER, Message(status, 10, 0), 0.0) is None
+        assert Leases().answer((PEER, ()), Message(status, 10, 0), 0.0) is None
 
 
 def test_a_full_house_refuses_until_a_lease_runs_out() -> None:
     leases = Leases()
     for number in range(SUBSCRIBERS):
-        assert subscribe(leases, 0.0, peer=("192.0.2.9", number)).status is Status.GRANTED
+        assert subscribe(leases, 0.0, peer=(f"192.0.2.{9 + number % 2}", number)).status is Status.GRANTED
     assert subscribe(leases, 1.0).status is Status.FULL
-    assert subscribe(leases, 1.0, peer=("192.0.2.9", 3)).status is Status.GRANTED, "those inside may stay"
+    assert subscribe(leases, 1.0, peer=("192.0.2.10", 3)).status is Status.GRANTED, "those inside may stay"
     assert (leases.refused, len(leases)) == (1, SUBSCRIBERS)
     assert subscribe(leases, 10.5).status is Status.GRANTED
+
+
+@pytest.mark.parametrize("host", ["192.0.2.9", "2001:db8::%d"])
+def test_one_host_never_has_all_places(host: str) -> None:
+    """An IPv6 host has as many addresses as it likes in its network."""
+    leases = Leases()
+    asked = [subscribe(leases, 0.0, peer=(host.replace("%d", f"{n + 1:x}"), n)).status for n in range(SUBSCRIBERS)]
+    assert asked == [Status.GRANTED] * 12 + [Status.FULL] * 4
+    assert subscribe(leases, 0.0).status is Status.GRANTED
+    assert subscribe(leases, 0.0, peer=("2001:db8:0:1::1", 7)).status is Status.GRANTED
 
 
 class Client:
@@ -201,7 +211,7 @@ async def test_a_stranger_gets_no_answer_and_a_gone_network_is_counted() -> None
 async def test_a_lease_runs_out_without_a_word() -> None:
     server = Subscriptions("127.0.0.1", 0, lambda _: True)
     await server.start()
-    subscribe(server.leases, asyncio.get_running_loop().time(), lease=5, peer=(("127.0.0.1", 9), ()))
+    subscribe(server.leases, asyncio.get_running_loop().time(), lease=5, peer=("127.0.0.1", 9))
     for _ in range(60):
         server.send(b"data")
         await asyncio.sleep(0.1)

@@ -22,8 +22,8 @@ def state(submaps: int, loose: int = 0) -> State:
     return restored(image(Shape(submaps=submaps, frames=1, beams=3, loose=loose)))
 
 
-def test_what_is_pickled_at_once_does_not_grow_with_the_submaps() -> None:
-    few, many = (len(capture(state(count, loose=count - 1), {})._root) for count in (4, 104))
+def test_what_is_copied_at_once_does_not_grow_with_the_submaps() -> None:
+    few, many = (capture(state(count, loose=count - 1), {}).copied_bytes for count in (4, 104))
     assert many - few < 100, "not even a reference to each"
 
 
@@ -32,7 +32,7 @@ def test_submaps_are_those_that_were_there_when_it_was_taken() -> None:
     keys, places = list(before.map.graph.submaps), [submap.place() for submap in before.map.graph.submaps.values()]
     taken = capture(before, {"one": before.map.graph.submaps[keys[2]]})
     del before.map.graph.submaps[keys[0]]
-    after, rest = restore(taken.pieces())
+    after, rest = restore(taken.nodes())
     assert list(after.map.graph.submaps) == keys
     assert rest["one"] is after.map.graph.submaps[keys[2]]
     assert all(
@@ -52,7 +52,7 @@ def test_a_drive_in_which_the_laser_tells_light_the_way_goes_on_from_any_moment(
         if not isinstance(record, Scan | LightEpoch):
             continue
         if count % 37 == 36:
-            then, _ = restore(capture(first, {}).pieces())
+            then, _ = restore(capture(first, {}).nodes())
             assert first.light is not None
             guided += first.light.has_motion
         if isinstance(record, Scan) and 6.0 < record.t_end < 6.3:  # somebody stands before it, all at once

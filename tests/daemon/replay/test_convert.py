@@ -130,6 +130,9 @@ def test_an_npz_becomes_a_log_without_wheels(tmp_path: Path) -> None:
         (b"", "the file is empty"),
         (b"1 2 3\n", r"a\.dat:1: 3 fields; a scan of this format has 707"),
         (b"x " * 707 + b"\n", r"a\.dat:1: could not convert"),
+        (b"nan " * 707 + b"\n", r"a\.dat:1: a field is not a number"),
+        (b"1 2 3\n" * 1000, r"a\.dat:1: 3 fields"),
+        ((b"5 " * 707 + b"\n") * 40, "all 40 stamps are equal"),
         (gzip.compress(b"1 2 3\n", mtime=0)[:12], "a.dat"),
         (b"PK\x03\x04 but no archive", "expected the arrays"),
     ],
@@ -145,6 +148,50 @@ def test_what_cannot_be_converted_is_named(
         convert.read(path)
     assert "lumiloop: " in capsys.readouterr().err
     assert not (tmp_path / "b.log").exists()
+
+
+@pytest.mark.parametrize("name", ["a.dat", "a.dat.gz"])
+def test_a_torn_end_costs_the_last_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    ranges = write_dat(tmp_path / "whole.dat")
+    torn = (tmp_path / "whole.dat").read_bytes()[:-150]
+    (tmp_path / name).write_bytes(gzip.compress(torn) if name.endswith(".gz") else torn)
+    words = ["convert", str(tmp_path / name), str(tmp_path / "b.log"), "--all", "--logged"]
+    assert parser.main(words) == 0
+    assert np.array_equal([scan.ranges for scan in scans_of(read_carmen(tmp_path / "b.log"))], ranges[:-1])
+    assert "skipped 1" in capsys.readouterr().err
+    (tmp_path / name).write_bytes(torn.replace(b" ", b" x", 1))  # and the first line is damaged
+    assert parser.main(words) == 0
+    assert np.array_equal([scan.ranges for scan in scans_of(read_carmen(tmp_path / "b.log"))], ranges[1:-1])
+
+
+def test_a_compressed_file_that_breaks_off_gives_what_it_holds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ranges = write_dat(tmp_path / "a.dat.gz", 400)
+    data = (tmp_path / "a.dat.gz").read_bytes()
+    (tmp_path / "a.dat.gz").write_bytes(data[: len(data) // 2])
+    assert parser.main(["convert", str(tmp_path / "a.dat.gz"), str(tmp_path / "b.log"), "--all", "--logged"]) == 0
+    found = scans_of(read_carmen(tmp_path / "b.log"))
+    assert 100 < len(found) < 300
+    assert np.array_equal([scan.ranges for scan in found], ranges[: len(found)])
+    assert "breaks off" in capsys.readouterr().err
+
+
+def test_a_host_clock_of_whole_seconds_or_set_back(tmp_path: Path) -> None:
+    write_dat(tmp_path / "a.dat", 200)
+    lines = (tmp_path / "a.dat").read_text().splitlines()
+    true = 0.1 * np.arange(200)
+
+    def times(stamps: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        told = [f"{round(1e6 * t)} {line.partition(' ')[2]}" for t, line in zip(stamps, lines, strict=True)]
+        (tmp_path / "b.dat").write_text("\n".join(told) + "\n")
+        scans = convert.even_stamps(convert.read(tmp_path / "b.dat"), 0.0)
+        assert any("clock" in note for note in scans.report.notes)
+        assert np.all(np.diff(scans.poses[5:-5, 0]) != 0.0)
+        return scans.stamps - scans.stamps[0]
+
+    assert times(np.floor(100.0 + true)) == pytest.approx(true, abs=0.06)
+    assert times(100.0 + true - 3.0 * (true > 10.0)) == pytest.approx(true, abs=1e-3)
 
 
 def test_an_npz_of_another_shape(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from daemon.config.schema import Config, LidarConfig, Mask, ModbusConfig, Mount
 from daemon.replay import convert
 from daemon.replay.log_replay import replay
 from daemon.replay.recorded_inputs import Given
+from daemon.replay.sources import open_log
 from daemon.runtime.budget import FixedBudget
 from daemon.runtime.cycle_parts import CycleRecord
 from daemon.runtime.worker import CycleWorker
@@ -156,7 +157,7 @@ def through_pty(scans: convert.Scans, model: LidarModel, lidar: LidarConfig, lin
 def from_log(path: Path, scans: convert.Scans, lidar: LidarConfig) -> list[Array]:
     """T_odom_base of every scan, by replay of the converted log with its stamps cut to milliseconds."""
     convert.write(path, scans, "test")
-    outcome = replay(path, Config(lidar=lidar), Given(file=True))
+    outcome = replay(open_log(path), Config(lidar=lidar), Given(file=True))
     return list(outcome.rerun.ledger.odom())
 
 

@@ -181,10 +181,12 @@ def test_the_sample_clock_of_another_air_interface_is_another(tmp_path: Path) ->
 
 def test_a_drive_knows_its_configuration_and_its_air_interface(tmp_path: Path) -> None:
     record(tmp_path, calm, lidar=True)
-    drive = read_drive(tmp_path, Config(), Given())
+    drive = read_drive(open_log(tmp_path), Config(), Given())
     assert (drive.config, drive.profile) == (settings(True, True), PROFILE_A)
     turned = replace(settings(True, True), lidar=replace(drive.config.lidar, mount=Mount(x=0.2, yaw=90.0)))
-    assert read_drive(tmp_path, turned, Given(keys=("lidar.mount",))).mount == pytest.approx((0.2, 0.0, np.pi / 2))
+    assert read_drive(open_log(tmp_path), turned, Given(keys=("lidar.mount",))).mount == pytest.approx(
+        (0.2, 0.0, np.pi / 2)
+    )
 
 
 def test_a_residual_map_that_went_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

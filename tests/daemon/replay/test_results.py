@@ -6,6 +6,8 @@ import errno
 import io
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +18,10 @@ from daemon.maps.grid_files import greys, map_files, map_yaml, pgm
 from daemon.maps.map_drawing import WALL, draw, lettered
 from daemon.maps.map_server import FREE, OCCUPIED
 from daemon.maps.png import encode_png
-from daemon.replay.results import Folder, OutputRefused, Trajectory, guessed, tum
-from daemon.snapshot import State
+from daemon.replay.results import Folder, OutputRefused, Trajectory, doubt, guessed, kitti, tum
+from daemon.replay.trajectories import Ledger
+from daemon.runtime.cycle_parts import CycleRecord
+from daemon.snapshot import Snapshot, State
 from estimator.mapping.occupancy_grid import Grid
 
 LOGITS = np.array([[4.0, 0.0, -4.0], [-1.4, -1.42, 0.61], [0.63, 10.0, -10.0]], dtype=np.float32)
@@ -40,6 +44,16 @@ GRID = Grid(np.array([-3.0, 7.5]), 0.05, LOGITS)
 def test_guesses_are_counted_in_a_sentence(states: list[State], said: str) -> None:
     count = len(states)
     assert guessed(Trajectory(np.arange(float(count)), np.zeros((count, 3)), np.array(states, np.int64))) == said
+
+
+@pytest.mark.parametrize(
+    ("guesses", "said"),
+    [(0, ""), (10, ""), (11, "11 % of the poses are guesses"), (100, "100 % of the poses are guesses")],
+)
+def test_guesses_in_more_than_a_tenth_are_a_warning(guesses: int, said: str) -> None:
+    states = np.repeat(np.array([State.RELOCATING, State.TRACKING], np.int64), [guesses, 100 - guesses])
+    assert doubt(Trajectory(np.arange(100.0), np.zeros((100, 3)), states)).startswith(said)
+    assert bool(doubt(Trajectory(np.arange(100.0), np.zeros((100, 3)), states))) == bool(said)
 
 
 def test_grid_pixels_run_from_the_top() -> None:
@@ -150,14 +164,46 @@ def test_no_seam_where_a_picture_was_drawn_in_bands() -> None:
 
 def test_tum_is_what_evo_and_the_benchmarks_read() -> None:
     path = Trajectory(
-        np.array([2.0, 1.0, 1.0]), np.array([(1.0, 2.0, np.pi / 2), (0, 0, 0.0), (0.1234567, -1.0, -3.0)])
+        np.array([2.0, 1.0, 1.5]), np.array([(1.0, 2.0, np.pi / 2), (0, 0, 0.0), (0.1234567, -1.0, -3.0)])
     )
     lines = tum(path).decode().splitlines()
     assert lines[0].startswith("#")
     assert lines[1] == "1.000000 0.000000 0.000000 0 0 0 0.000000000 1.000000000"
-    assert lines[2].startswith("1.000000 0.123457 -1.000000 0 0 0 -0.997494987 0.0707372")
+    assert lines[2].startswith("1.500000 0.123457 -1.000000 0 0 0 -0.997494987 0.0707372")
     assert lines[3] == "2.000000 1.000000 2.000000 0 0 0 0.707106781 0.707106781"
     assert all(len(line.split(" ")) == 8 for line in lines[1:])
+
+
+@pytest.mark.parametrize("begin", [0.0, 1.7e9])
+def test_a_file_has_one_pose_for_an_instant_the_last_one(begin: float) -> None:
+    """Equal to the microsecond that is written; the file's order is that of time."""
+    stamps = begin + np.array([1.0, 2.0, 1.0, 1.0000003, 0.5, 2.0])
+    path = Trajectory(stamps, np.column_stack([np.arange(6.0), np.zeros(6), np.zeros(6)]))
+    lines = [line.split(" ") for line in tum(path).decode().splitlines()[1:]]
+    assert [(float(line[0]) - begin, float(line[1])) for line in lines] == [(0.5, 4.0), (1.0, 3.0), (2.0, 5.0)]
+    assert [float(line.split(" ")[3]) for line in kitti(path).decode().splitlines()] == [4.0, 3.0, 5.0]
+
+
+def cycle(x: float) -> CycleRecord:
+    """A cycle that consumed a scan and published the pose (x, 0, 0) of the instant 5 s."""
+    result: Any = SimpleNamespace(
+        t_mono=5.0, anchor=9, jumps=0, lights=None, T_odom_base=np.array((x, 0.0, 0.0)), T_anchor_base=np.zeros(3)
+    )
+    snapshot = Snapshot(1, 5.0, 5.0, 5.0, State.TRACKING, 0, pose=(x, 0.0, 0.0))
+    return CycleRecord(1, 5.0, 1, (), 0, 0, (), (), None, result, snapshot, {})
+
+
+def test_a_correction_of_the_same_instant_replaces_its_row() -> None:
+    """Two cycles of a late scan: the pose's instant stays, its place does not."""
+    ledger = Ledger()
+    rows = [ledger.add(cycle(x), 10.0, 5.0) for x in (0.0, 0.3)]
+    ledger.settle({})
+    rows.append(ledger.add(cycle(0.4), 10.0, 5.0))  # what is settled stays
+    rows.append(ledger.add(cycle(0.5), 10.5, 5.0))
+    assert rows == [0, 0, 1, 2]
+    ledger.settle({})
+    assert ledger.online().poses[:, 0].tolist() == ledger.final().poses[:, 0].tolist() == [0.3, 0.4, 0.5]
+    assert [line.split(" ")[1] for line in tum(ledger.final()).decode().splitlines()[1:]] == ["0.400000", "0.500000"]
 
 
 def test_no_poses_no_lines() -> None:

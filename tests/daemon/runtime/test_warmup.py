@@ -135,16 +135,22 @@ def test_a_start_whose_kernels_are_there_waits_for_nobody() -> None:
     assert done.stderr == ""
 
 
-@pytest.mark.jit
-def test_a_start_of_which_one_kernel_is_missing_waits_before_it_compiles_it(tmp_path: Path) -> None:
-    """The mark says that all are there: nothing is written beside somebody who compiles, nor is half a file read."""
-    warmup.load()
-    folder = tmp_path / CACHE_DIR.name
+def kernels_copied(root: Path) -> Path:
+    """The kernels of this tree with their mark, below another cache root."""
+    folder = root / CACHE_DIR.name
     for package in (path.parent for path in (ROOT / "estimator").glob("*/__init__.py")):
         name = f"{package.name}_{hashlib.sha1(str(package).encode()).hexdigest()}"  # as numba names it
         if (CACHE_DIR / name).exists():
             shutil.copytree(CACHE_DIR / name, folder / name)
     shutil.copy(warmup.mark_of("warm"), folder)
+    return folder
+
+
+@pytest.mark.jit
+def test_a_start_of_which_one_kernel_is_missing_waits_before_it_compiles_it(tmp_path: Path) -> None:
+    """The mark says that all are there: nothing is written beside somebody who compiles, nor is half a file read."""
+    warmup.load()
+    folder = kernels_copied(tmp_path)
     missing = min(folder.glob("scan_matching_*/deskew.*.nbc"))
     missing.unlink()
     half = missing.with_name(f"{missing.name}.tmp.0123456789abcdef")
@@ -323,18 +329,17 @@ def test_a_lock_of_another_user_is_named_with_its_remedy(monkeypatch: pytest.Mon
         warmup.load()
 
 
-def test_a_warm_up_that_an_earlier_start_has_done_loads_nothing() -> None:
-    """At every boot the daemon waits for it, and then loads the same itself."""
+def test_warm_loads_what_an_earlier_start_has_compiled() -> None:
+    """A mark says that they were good, and only loading that they still are."""
     warmup.load()
     code = (
         "import sys; from daemon.cli.parser import main\n"
         "assert main(['warm', '--set', 'modbus.port=0']) == 0\n"
-        "loaded = {'numpy', 'numba', 'llvmlite', 'estimator.pipeline', 'estimator.numerics.jit'} & set(sys.modules)\n"
-        "print(sorted(loaded))"
+        "print('estimator.pipeline' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
-    assert done.stderr == "lumiloop: an earlier start has compiled the kernels\n"
+    assert done.stdout == "True\n"
+    assert done.stderr.startswith("lumiloop: an earlier start has compiled the kernels; they load in ")
 
 
 def test_a_mark_without_kernels_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

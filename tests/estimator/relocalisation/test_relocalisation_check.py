@@ -50,7 +50,7 @@ def looked(verdict: Verdict) -> Looked:
 def test_three_contradictions_without_one_that_holds_end_it(verdicts: list[Verdict], lost: bool) -> None:
     state, seen, _ = watched()
     for verdict in verdicts:
-        relocalisation_check.take(state, seen, looked(verdict))
+        relocalisation_check.take_check(state, seen, looked(verdict))
     assert (state.map.parts.detached is not None) == lost
     assert (state.map.parts.trial is None) == lost
 
@@ -59,7 +59,7 @@ def test_an_answer_to_a_place_given_up_meanwhile_counts_for_nothing() -> None:
     state, seen, _ = watched()
     state.map.parts.trial = None
     for _ in range(5):
-        relocalisation_check.take(state, seen, looked(Verdict.NO))
+        relocalisation_check.take_check(state, seen, looked(Verdict.NO))
     assert state.map.parts.detached is None
 
 
@@ -109,7 +109,7 @@ def test_what_was_mapped_in_a_place_that_was_the_wrong_one_goes_if_the_laser_alo
         older = {key: one for key, one in state.map.keyframes.items() if key < newest.first}
         assert (newest.key in {piece.key for piece in image_of(state).unsettled}) == (not alone)
         for _ in range(relocalisation_check.STRIKES):
-            relocalisation_check.take(state, seen, looked(Verdict.NO))
+            relocalisation_check.take_check(state, seen, looked(Verdict.NO))
         assert (newest.key in state.map.graph.submaps) == (not alone)
         assert (newest.key in state.map.graph.constraints.between) == (not alone)
         assert (state.map.keyframes == older) == alone
@@ -129,7 +129,7 @@ def test_the_live_map_no_longer_shows_it() -> None:
     late = state.jobs.take()
     assert late
     for _ in range(relocalisation_check.STRIKES):
-        relocalisation_check.take(state, seen, looked(Verdict.NO))
+        relocalisation_check.take_check(state, seen, looked(Verdict.NO))
     for job in late:
         take_answer(state.map, state.pose, state.motion, Answer(0.0, job.job_id, job.run()))
     go_on(state.map.live, state.map.graph)

@@ -245,7 +245,7 @@ def test_carried_off_beside_a_map_that_is_set_aside_the_search_in_that_begins_an
 def test_a_kept_state_holds_what_was_set_aside() -> None:
     drive = Drive(made(HOUSE, 0.0, 4.0), 60.0)
     drive.on(8.0)
-    state, _ = restore(capture(drive.state, {}).pieces())
+    state, _ = restore(capture(drive.state, {}).nodes())
     stored, kept = state.map.parts.aside, drive.state.map.parts.aside
     assert isinstance(stored, SearchedAside)
     assert kept is not None

@@ -26,7 +26,7 @@ def seeds() -> list[bytes]:
         InputDatagram(ODOMETRY_MAGIC, 7, k, k % 2, 1000.0 + k, (0.1 * k, -0.2, 3.0)) for k in (0, 1, 2, 5, 2**32 - 1)
     ]
     gyro = [InputDatagram(IMU_MAGIC, 8, k, 1, 1000.0, (0.5,)) for k in (0, 3)]
-    cookie = udp_subscriptions.Leases(bytes(32))._cookie(("192.0.2.1", udp_subscriptions.SIZE), 1000.0)
+    cookie = udp_subscriptions.Leases(bytes(32))._cookie((("192.0.2.1", udp_subscriptions.SIZE), ()), 1000.0)
     asked = [udp_subscriptions.Message(udp_subscriptions.Status(k), 60, (0, cookie)[k % 2]) for k in range(5)]
     asked += [udp_subscriptions.Message(udp_subscriptions.Status.ASK, lease, cookie) for lease in (0, 1, 65535)]
     sent = [*(encode(one) for one in (*readings, *gyro)), registers.encode_datagram(snapshot())]
@@ -71,7 +71,7 @@ def feeder() -> Callable[[bytes], None]:
         asked: list[udp_subscriptions.Message] = []
         refused(lambda: asked.append(udp_subscriptions.decode(data)), by=ValueError)
         for message in asked:
-            answer = leases.answer(("192.0.2.1", len(data)), message, state["t"])
+            answer = leases.answer((("192.0.2.1", len(data)), ()), message, state["t"])
             assert answer is None or len(udp_subscriptions.encode(answer)) <= len(data)
             assert len(leases) <= udp_subscriptions.SUBSCRIBERS
 

@@ -116,7 +116,7 @@ def test_an_address_belongs_to_who_spoke_to_it_first(monkeypatch: pytest.MonkeyP
     first, second = open_linux("/dev/i2c-1"), open_linux("/dev/i2c-1")
     for _ in range(2):  # its own lock is in nobody's way
         first.transfer((read(0x4D, 2),))
-    with pytest.raises(OSError, match="address 0x4d is in use by another program") as caught:
+    with pytest.raises(OSError, match="another lumiloop, or its bus server, uses address 0x4d") as caught:
         second.transfer((read(0x4D, 2),))
     assert caught.value.errno == errno.EBUSY
     with pytest.raises(OSError) as caught:  # noqa: PT011 - nobody answers there: another address is not locked
@@ -143,7 +143,7 @@ async def test_a_bus_that_was_closed_while_a_transaction_hangs_has_no_address(mo
     linux.hang = False
     await asyncio.gather(hanging, waiting)
     await again.transfer((read(0x4D, 2),))  # the end of the first one has not taken its address away
-    with pytest.raises(OSError, match="in use by another program"):
+    with pytest.raises(OSError, match="another lumiloop"):
         open_linux("/dev/i2c-1").transfer((read(0x4D, 2),))
     await again.close()
 

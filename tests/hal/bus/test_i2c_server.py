@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import os
 import socket
 import subprocess
 import sys
@@ -21,11 +23,45 @@ from tests.hal.bus.remote_bus import served
 
 
 async def test_two_clients_take_turns(tmp_path: Path) -> None:
-    async with served("unix", tmp_path) as (where, _, _schedule):
+    async with served("unix", tmp_path) as (where, fake, _schedule):
+        fake.add_level(lambda t: t % 1.0)
         one, two = await open_bus(where), await open_bus(where)
-        done = await asyncio.gather(*(bus.transfer((read(0x4D, 400),)) for bus in (one, two, one, two)))
+        clients = ((one, 0x4D), (two, 0x48), (one, 0x4D), (two, 0x48))
+        done = await asyncio.gather(*(bus.transfer((read(address, 400),)) for bus, address in clients))
         spans = sorted((d.t1 - d.t0) for d in done)
         assert spans[-1] > 1.5 * spans[0]  # two of them had to wait for another one's
+        await one.close()
+        await two.close()
+
+
+@pytest.mark.parametrize("kind", ["unix", "tcp"])
+async def test_a_converter_has_one_lumiloop_at_a_time(kind: str, tmp_path: Path) -> None:
+    """Another process is refused as this one is; its error names the process that has the converter."""
+    async with served(kind, tmp_path) as (where, _, _schedule):
+        one, two = await open_bus(where), await open_bus(where)
+        for _ in range(2):
+            await one.transfer((read(0x4D, 2),))
+        with pytest.raises(OSError, match=rf"another lumiloop \(process {os.getpid()}\) uses address 0x4d") as caught:
+            await two.transfer((read(0x4D, 2),))
+        assert caught.value.errno == errno.EBUSY
+        imports = "from hal.bus.i2c import read; from hal.bus.i2c_remote import open_remote"
+        program = f"{imports}; open_remote({where!r}).transfer((read(0x4D, 2),))"
+        command = [sys.executable, "-c", program]
+        other = await asyncio.create_subprocess_exec(*command, stderr=asyncio.subprocess.PIPE)
+        _, said = await other.communicate()
+        assert f"another lumiloop (process {os.getpid()}) uses address 0x4d" in said.decode()
+        await one.close()
+        await two.transfer((read(0x4D, 2),))  # free again, without a word to anybody
+        await two.close()
+
+
+async def test_a_link_to_the_socket_is_the_same_bus(tmp_path: Path) -> None:
+    async with served("unix", tmp_path) as (where, _, _schedule):
+        (tmp_path / "link").symlink_to(where.removeprefix("unix:"))
+        one, two = await open_bus(where), await open_bus(f"unix:{tmp_path}/link")
+        await one.transfer((read(0x4D, 2),))
+        with pytest.raises(OSError, match="another lumiloop"):
+            await two.transfer((read(0x4D, 2),))
         await one.close()
         await two.close()
 

@@ -61,7 +61,7 @@ class TestWords:
         on_fake(body, model, device="/dev/ttyUSB7" if rs232 else PORT)
 
     def test_ladder_of_a_sensor_that_never_delivers(self) -> None:
-        """QT, then a reset, then a new connection, then a reboot; and again, for ever, with waits between."""
+        """QT, then a reset, then a new connection, then reboots at growing distances, for ever."""
 
         async def body(bench: Bench) -> None:
             assert bench.plugs is not None
@@ -69,15 +69,15 @@ class TestWords:
             bench.order('[[fault]]\nwhat = "intermittent"\nshare = 1.0')
             driver = bench.driver()
             async with bench.running(driver):
-                await asyncio.sleep(300.0)
+                await asyncio.sleep(1500.0)
                 first = {word: words.index(word) for word in ("QT", "VV", "RT", "RB")}
                 assert first["QT"] < first["VV"] < first["RT"] < first["RB"]
                 assert words[first["RB"] + 1] == "RB"  # a pair within a second
                 streams = [i for i, word in enumerate(words) if word.startswith("MD")]
                 assert sum(i < first["RT"] for i in streams) == 2
                 assert bench.plugs.opened > 5
-                assert words.count("RB") > 6
-                assert len(words) < 1500  # it does not spin
+                assert words.count("RB") == 8
+                assert len(words) < 2500  # it does not spin
                 assert isinstance(error_of(driver), DeviceFault)
                 assert bench.faults is not None
                 bench.faults.clear()
@@ -93,7 +93,7 @@ class TestWords:
             words = heard(bench)
             bench.order('[[fault]]\nwhat = "bit_flip"\npart = "data"')
             async with bench.running(bench.driver()):
-                await asyncio.sleep(60.0)
+                await asyncio.sleep(120.0)
             assert bench.scans == []
             assert "RT" in words
             assert "RB" in words

@@ -43,8 +43,13 @@ def test_geometry_is_what_the_sensor_states() -> None:
         ("SCAN", "9" * 5000),
         ("DMIN", "60000"),
         ("DMIN", "-5"),
-        ("DMAX", "300000"),
-        ("AFRT", "1081"),
+        ("AFRT", "2881"),
+        ("AFRT", "-2881"),
+        ("SCAN", "2,400"),
+        ("SCAN", "24e2"),
+        ("AMAX", "1080.5"),
+        ("AMAX", "1O80"),
+        ("AMAX", "0x438"),
     ],
 )
 def test_parameters_that_make_no_sense_are_refused(key: str, value: str) -> None:
@@ -105,6 +110,11 @@ def test_codes_are_told_in_words() -> None:
     assert urg.code_text(18) == "reflection too strong"
     assert urg.code_text(13) == "error code without published meaning"
     assert urg.code_text(5601) == "no return"
+    assert utm(MODL="NEW-50LX", DMAX="300000").code_text(65533) == "no return"
+
+
+def test_a_dmax_beyond_what_a_reply_can_carry() -> None:
+    assert utm(DMAX="300000").geometry.dmax == 262143
 
 
 @pytest.mark.parametrize(

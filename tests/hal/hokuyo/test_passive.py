@@ -48,6 +48,24 @@ def test_without_geometry_scans_are_counted_and_with_a_given_one_used() -> None:
     assert scan.geometry is given
 
 
+def test_odd_texts_and_their_order_do_not_matter() -> None:
+    """VV with bytes above 127, or after PP; a PP that the firmware sums in its own way, twice; scans after either."""
+    latin = encoder.text("VV", encoder.VV_UTM).replace(b"Hokuyo", b"H\xf6kuy\xf6")
+    pp = encoder.text("PP", encoder.PP_UTM)
+    odd = pp.replace(b"SCAN:2400;" + pp.rstrip()[-1:], b"SCAN:2400;z")
+    assert odd != pp
+    for texts, serial in (
+        (latin + pp, "H0900001"),
+        (pp + latin, "H0900001"),
+        (odd + odd, ""),
+        (latin + odd + odd, None),
+    ):
+        listener = PassiveHokuyo()
+        listener.feed(texts, 0.0)
+        (scan,) = listener.feed(frame(0), 1.0)
+        assert scan.geometry.serial == ("H0900001" if serial is None else serial)
+
+
 def test_damage_is_counted_and_leaves_a_gap_in_seq() -> None:
     listener = PassiveHokuyo()
     listener.feed(UTM, 0.0)

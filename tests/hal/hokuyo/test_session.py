@@ -11,7 +11,8 @@ from hal.clock import LoopClock, run_virtual
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.hokuyo.payload import ScanRequest
 from hal.hokuyo.scip_line import Line
-from hal.hokuyo.session import AbnormalState, Session, explain_status
+from hal.hokuyo.sensor_errors import AbnormalState, NotReady, SelfReport
+from hal.hokuyo.session import Session
 from hal.port.port import MemoryPort, memory_pair
 from tests.hal.hokuyo import encoder
 
@@ -193,7 +194,7 @@ class TestIdentify:
 
         async def body(session: Session) -> None:
             who = await session.identify()
-            assert (who.geometry.serial, session.health) == ("H0900001", "Sensor works well.")
+            assert (who.geometry.serial, session.report.health) == ("H0900001", "Sensor works well.")
 
         with_session(script, body)
         assert script.received == ["VV", "PP", "II"]
@@ -201,7 +202,7 @@ class TestIdentify:
     def test_without_ii(self) -> None:
         async def body(session: Session) -> None:
             await session.identify()
-            assert session.health == ""
+            assert session.report == SelfReport()
 
         with_session(Scripted(**GOOD, QT=[OK]), body)
 
@@ -231,9 +232,25 @@ class TestIdentify:
         assert script.received.count("VV") == 2
 
     def test_never_readable(self) -> None:
-        replies: list[str | bytes | None] = [GOOD["VV"][0].replace(b"H0900001", b"H090000%d" % i) for i in range(2, 9)]
-        with pytest.raises(DeviceFault, match="VV: checksum"):
-            with_session(Scripted(VV=replies), lambda session: session.identify())  # type: ignore[arg-type, return-value]  # raises
+        replies: list[str | bytes | None] = [GOOD["PP"][0].replace(b"1080", b"108%d" % i) for i in range(1, 9)]
+        with pytest.raises(DeviceFault, match="PP: checksum"):
+            with_session(Scripted(VV=GOOD["VV"], PP=replies), lambda session: session.identify())  # type: ignore[arg-type, return-value]  # raises
+
+    def test_vv_that_is_never_readable_is_not_needed(self) -> None:
+        others = (
+            b"H09%05d" % i for i in range(20, 60) if sum(map(int, str(i))) not in (1, 6)
+        )  # sums with and without ;
+        replies: list[str | bytes | None] = [GOOD["VV"][0].replace(b"H0900001", other) for other in others]
+
+        async def body(session: Session) -> None:
+            assert (await session.identify()).geometry.serial == ""
+
+        with_session(Scripted(VV=replies, PP=GOOD["PP"]), body)
+
+    @pytest.mark.parametrize("answer", ["10", "0E", "0M", None])
+    def test_pp_refused_or_not_answered_is_a_sensor_that_starts(self, answer: str | None) -> None:
+        with pytest.raises(NotReady, match="PP: "):
+            with_session(Scripted(QT=[OK], TM2=["10"], VV=[answer], PP=[answer]), lambda session: session.identify())  # type: ignore[arg-type, return-value]  # raises
 
     def test_no_lidar(self) -> None:
         script = Scripted(VV=GOOD["VV"], PP=[encoder.text("PP", [("MODL", "Coffee machine")])])
@@ -358,11 +375,6 @@ class TestStart:
     def test_refusals(self, status: str, kind: type[HalError], words: str) -> None:
         with pytest.raises(kind, match=words):
             self.start(Scripted(MD=[status]))
-
-    def test_the_sensors_own_words_go_with_the_error(self) -> None:
-        assert "Trouble!! Error No. =[00->33]" in str(
-            explain_status("/dev/x", "MD", "50", "Trouble!! Error No. =[00->33]")
-        )
 
 
 def test_quiet_never_takes_long_and_never_raises() -> None:

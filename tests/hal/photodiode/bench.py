@@ -153,7 +153,7 @@ def error_of(driver: PhotodiodeAdc) -> HalError:
 
 TRUE_S = 5e-6
 """How far the bounds of a time may be off: jitter of what was measured, and the opening of the sample switch."""
-DAMAGED = Blemish.MISALIGNED | Blemish.STUCK | Blemish.CLIPPED | Blemish.SHORT
+DAMAGED = Blemish.MISALIGNED | Blemish.STUCK | Blemish.CLIPPED | Blemish.SHORT | Blemish.REPAIRED
 
 DARK_WORDS = 2.0
 """The bench's light swings by hundreds of words: a block below this was ordered to be dark."""

@@ -91,6 +91,64 @@ def test_a_whole_block_at_a_rail_is_constant() -> None:
     assert not defects.floated
 
 
+LIVE = [2000 + 37 * k % 101 for k in range(500)]
+"""Words of a live signal."""
+
+
+@pytest.mark.parametrize("places", [[0], [7], [499], [10, 40, 250], [0, 9, 18], list(range(5, 500, 50))])
+@pytest.mark.parametrize("mask", [0x8000, 0x1000, 0xF000, 0xFFFF, 0x4321])
+def test_single_damaged_words_cost_these_words_only(places: list[int], mask: int) -> None:
+    smooth = [2000 + k for k in range(500)]
+    hit = [word ^ mask if k in places else word for k, word in enumerate(smooth)]
+    words, blemish, defects = inspect(block(hit), 1000, 0xF000, 12)
+    assert blemish == Blemish.REPAIRED
+    assert (defects.repaired, defects.misaligned) == (len(places), 0.0)
+    assert np.abs(words.astype(int) - smooth).max() <= (1 if {0, 499} & set(places) else 0)
+
+
+@pytest.mark.parametrize("places", [[100, 101], [100, 108], list(range(0, 500, 40)), [3, 100, 104, 400]])
+def test_damaged_words_close_together_or_many_are_a_shift(places: list[int]) -> None:
+    hit = [word | 0x8000 if k in places else word for k, word in enumerate(LIVE)]
+    words, blemish, defects = inspect(block(hit), 1000, 0xF000, 12)
+    assert blemish == Blemish.MISALIGNED
+    assert defects.misaligned == len(places) / 500
+    assert words.tolist() == LIVE
+
+
+def shifted(words: list[int], bits: int, at: int = 0) -> bytes:
+    """The bytes of words after the loss of some clocks before word ``at``; the missing bits at the end read 1."""
+    kept, rest = block(words[:at]), block(words[at:])
+    number = (int.from_bytes(rest, "big") << bits) | ((1 << bits) - 1)
+    return kept + (number & ((1 << 8 * len(rest)) - 1)).to_bytes(len(rest), "big")
+
+
+@pytest.mark.parametrize("at", [0, 100, 400])
+@pytest.mark.parametrize("bits", [1, 2, 3, 4, 5])
+def test_lost_high_bits_show_where_all_words_are_low(bits: int, at: int) -> None:
+    """No spare bit is set: the words are merely too large."""
+    low = [40 + 13 * k % 23 for k in range(500)]
+    _, blemish, defects = inspect(shifted(low, bits, at), 1000, 0xF000, 12)
+    assert Blemish.MISALIGNED in blemish
+    assert defects.lost_bits
+    assert defects.misaligned >= (500 - at - 10) / 500
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [40 + 13 * k % 23 for k in range(500)],
+        [40 + 2 * (k % 2) for k in range(500)],  # an input that toggles
+        [2048] * 500,
+        [57, 40, 28] + [16] * 497,  # at the lower rail, after a slope
+    ],
+    ids=["live", "toggles", "constant", "rail"],
+)
+def test_no_bits_are_lost(words: list[int]) -> None:
+    _, blemish, defects = inspect(block(words), 1000, 0xF000, 12)
+    assert Blemish.MISALIGNED not in blemish
+    assert not defects.lost_bits
+
+
 def test_census_counts_words_with_bits_too_many() -> None:
     _, _, defects = inspect(block([0x1800, 0x0800, 0x0801, 0x0802]), 8, 0xF000, 12)
     assert defects.misaligned == 0.25
@@ -137,9 +195,9 @@ def test_what_is_no_adc121c021(answers: tuple[bytes | None, ...], says: str) -> 
 @pytest.mark.parametrize(
     ("configuration", "word"),
     [
-        (ads1x15.Configuration(0, 2, 4, single=True, start=True), 0xC583),  # AIN0 to GND, 2.048 V, single
-        (ads1x15.Configuration(0, 1, 4), 0x4283),  # AIN0 to GND, 4.096 V, continuous, DR 4
-        (ads1x15.Configuration(3, 5, 7), 0x7AE3),  # AIN3 to GND, 0.256 V, continuous, DR 7
+        (ads1x15.Configuration(0, 2, 4, single=True, start=True), 0xC597),  # AIN0 to GND, 2.048 V, single
+        (ads1x15.Configuration(0, 1, 4), 0x4297),  # AIN0 to GND, 4.096 V, continuous, DR 4
+        (ads1x15.Configuration(3, 5, 7), 0x7AF7),  # AIN3 to GND, 0.256 V, continuous, DR 7
     ],
 )
 def test_ads1x15_configuration(configuration: ads1x15.Configuration, word: int) -> None:
@@ -155,8 +213,12 @@ def test_ads1x15_fields_out_of_range(fields: dict[str, int]) -> None:
 
 def test_ads1x15_configuration_read_back() -> None:
     wanted = ads1x15.Configuration(0, 1, 4)
-    assert ads1x15.same_configuration(b"\x42\x83", wanted)
-    assert ads1x15.same_configuration(b"\xc2\x83", wanted)  # bit 15: no conversion running just now
+    assert ads1x15.same_configuration(b"\x42\x97", wanted)
+    assert not ads1x15.same_configuration(b"\x42\x83", wanted), "the same input, as another program writes it"
+    assert ads1x15.after_reset(b"\x85\x83")
+    assert ads1x15.after_reset(b"\x05\x83")
+    assert not ads1x15.after_reset(b"\x42\x97")
+    assert ads1x15.same_configuration(b"\xc2\x97", wanted)  # bit 15: no conversion running just now
     assert not ads1x15.same_configuration(b"\x85\x83", wanted)
     assert not ads1x15.same_configuration(b"\x42", wanted)
 

@@ -8,6 +8,7 @@ import logging
 import numpy as np
 import pytest
 
+from hal.adc import Blemish
 from hal.photodiode.dc_channel import LevelInput
 from hal.photodiode.driver import Sampling
 from tests.hal.photodiode.bench import Bench, on_fake
@@ -158,6 +159,41 @@ def test_a_brownout_of_the_dc_channel_is_no_darkness() -> None:
                 assert driver.status.extra["dc_level"] == "40.0 %"
 
     on_fake(body)
+
+
+@pytest.mark.parametrize("every_s", [0.02, 0.3, 1.1])
+@pytest.mark.parametrize(
+    ("chip", "config"),
+    [("ADS1115", config) for config in (0x5283, 0x4283, 0x4383, 0xD3E3, 0x0000)] + [("ADS1015", 0x5283)],
+)
+def test_another_program_on_the_chip_is_noticed_and_its_input_is_no_level(
+    chip: str, config: int, every_s: float, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever it sets, the same input in the same range among it: no level, or the right one; one line in the log."""
+    monkeypatch.setattr("hal.photodiode.dc_channel.CALM_S", 10.0)
+
+    async def body(bench: Bench) -> None:
+        with_level(bench, chip=chip)
+        driver = bench.driver(DC)
+        async with bench.running(driver):
+            await bench.more(60, 10.0, driver)
+            bench.order(f"what = 'foreign'; config = {config}; every_s = {every_s}")
+            seen: set[str] = set()
+            for _ in range(400):
+                await asyncio.sleep(0.03)
+                seen.add(driver.status.extra["dc_level"])
+            assert not [said for said in seen if said.split()[0] not in ("40.0", "another")], seen
+            assert any("another program changes the chip's configuration" in said for said in seen)
+            bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
+            await asyncio.sleep(15.0)
+            assert driver.status.extra["dc_level"] == "40.0 %"
+            assert not any(block.blemish for block in bench.blocks[60:] if block.blemish is not Blemish.GAP)
+
+    with caplog.at_level(logging.INFO, "hal"):
+        on_fake(body)
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 1, told
+    assert "another program changes the chip's configuration" in told[0]
 
 
 @pytest.mark.parametrize("wrong", ["LM75", "24C02"])

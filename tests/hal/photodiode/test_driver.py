@@ -233,3 +233,43 @@ def test_stopping_during_an_open_that_hangs() -> None:
             assert ended.is_set()
 
     on_fake(body)
+
+
+@pytest.mark.parametrize("words", [1, 10])
+def test_a_damaged_word_costs_that_word_and_not_the_block(words: int) -> None:
+    async def body(bench: Bench) -> None:
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+            bench.order(f"what = 'hit'; words = {words}; mask = 0xf800")
+            blocks = (await bench.more(42, 10.0, driver))[2:]
+            assert driver.status.error is None
+        times = bench.light.asked[-1]
+        codes = np.floor(4096.0 * bench.light.at(times))
+        assert all(block.blemish is Blemish.REPAIRED for block in blocks)
+        off = np.abs(blocks[-1].words.astype(float) - codes)
+        assert 0 < np.count_nonzero(off) <= words
+        assert off.max() < 0.05 * 4096
+
+    on_fake(body)
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_lost_clocks_are_told_where_the_light_is_low(bits: int) -> None:
+    async def body(bench: Bench) -> None:
+        bright = bench.device._source
+        bench.device._source = lambda t: 0.01 + 0.03 * bright(t)
+        driver = bench.driver()
+        async with bench.running(driver):
+            await bench.more(30, 10.0, driver)
+            bench.order(f"what = 'shift'; bits = {bits}")
+            seen: set[str] = set()
+            for _ in range(100):
+                await asyncio.sleep(0.01)
+                seen.add(str(driver.status.error))
+            assert any("words without their highest bits (another kind of chip, or bits lost" in said for said in seen)
+            bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
+            await bench.more(20, 10.0, driver)
+            assert driver.status.error is None
+
+    on_fake(body)

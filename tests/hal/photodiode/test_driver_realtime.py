@@ -104,7 +104,9 @@ def test_a_kernel_driver_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None
         async with bench.running(driver):
             await asyncio.sleep(0.3)
             assert isinstance(error_of(driver), DeviceRefused)
-            assert "address 0x4d is in use by another program, or by a kernel driver" in str(error_of(driver))
+            assert "address 0x4d is in use by another lumiloop or program, or by a kernel driver" in str(
+                error_of(driver)
+            )
 
     on_kernel(body, monkeypatch)
 
@@ -123,7 +125,7 @@ def test_a_second_program_gets_the_converter_when_the_first_has_ended(monkeypatc
                         await bench.more(1, 3.0 * SLACK, first)
                 await bench.more(10, 3.0 * SLACK, first)  # and goes on being refused
                 assert isinstance(error_of(second), DeviceRefused)
-                assert "address 0x4d is in use by another program" in str(error_of(second))
+                assert "another lumiloop, or its bus server, uses address 0x4d" in str(error_of(second))
                 assert second.status.blocks == 0
                 assert first.status.error is None
         async with bench.running(second):

@@ -26,6 +26,17 @@ def test_reads_what_was_captured(tmp_path: Path) -> None:
     assert report.used == {"chunks": 3, "bytes": 8}
 
 
+def test_a_host_clock_that_was_set_or_stands_still(tmp_path: Path) -> None:
+    true = [10_000 * i for i in range(200)]
+    path, report = tmp_path / "a.logr", LogReport()
+    path.write_bytes(pack([Chunk(t - (700_000 if t > 1_000_000 else 0) + 10**9, b"x") for t in true]))
+    assert [chunk.t_us - 10**9 for chunk in read_capture(path, report)] == pytest.approx(true, abs=2)
+    assert any("clock was set" in note for note in report.notes)
+    path.write_bytes(pack([Chunk(7, b"x")] * 200))
+    with pytest.raises(DataInvalid, match="all 200 times in it are equal"):
+        read_capture(path, LogReport())
+
+
 @pytest.mark.parametrize("cut", range(1, 12))
 def test_a_torn_end_costs_the_last_chunk(tmp_path: Path, cut: int) -> None:
     path = tmp_path / "a.logr"

@@ -221,6 +221,41 @@ def test_beam_times_of_a_converted_log_delay_the_delivery(tmp_path: Path) -> Non
     assert (scan.geometry.period_s, scan.geometry.model, scan.geometry.dmin) == (0.1, "X", 300)
 
 
+@pytest.mark.parametrize(
+    ("stamps", "says"),
+    [
+        ([0.0] * 20, "all 20 stamps are equal"),
+        ([20.0 - 0.1 * i for i in range(20)], "19 run back"),
+        ([100.0 * i for i in range(20)], "no seconds"),
+    ],
+)
+def test_a_log_without_usable_time_is_refused(tmp_path: Path, stamps: list[float], says: str) -> None:
+    path = write(tmp_path / "a.log", [flaser(t, robot=(i, 0.0, 0.0)) for i, t in enumerate(stamps)])
+    with pytest.raises(DataInvalid, match=says) as caught:
+        read_carmen(path)
+    assert str(path) in str(caught.value)
+    assert "in seconds" in caught.value.remedy
+
+
+def test_whole_seconds_and_a_set_clock_are_read_right_and_said(tmp_path: Path) -> None:
+    true = [0.1 * i for i in range(100)]
+    whole = read_carmen(write(tmp_path / "a.log", [flaser(int(t), robot=(t, 0, 0)) for t in true]))
+    assert np.ptp(whole.time - true) < 0.11
+    assert np.all(np.diff(whole.stamps) > 0.05)
+    assert any("clock steps by 1 s" in note for note in whole.report.notes)
+    late = [flaser(1e9 + t - 3.0 * (t > 5.05), robot=(t, 0, 0)) for t in true]
+    bridged = read_carmen(write(tmp_path / "b.log", late))
+    assert bridged.time == pytest.approx(true, abs=1e-5)
+    assert any("was set 1 times" in note for note in bridged.report.notes)
+
+
+def test_odometry_lines_of_one_stamp_are_not_used(tmp_path: Path) -> None:
+    lines = [f"ODOM {i} 0 0 0 0 0 7.0 h 0" for i in range(5)]
+    log = read_carmen(write(tmp_path / "a.log", [*lines, *(flaser(10.0 + i) for i in range(5))]))
+    assert not log.has_odometry
+    assert any("one stamp" in note for note in log.report.notes)
+
+
 def test_broken_lines_are_skipped_with_their_numbers(tmp_path: Path) -> None:
     lines = ["# a comment", *drive(30), "PARAM"]
     lines[3] = lines[3][:200]

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from types import SimpleNamespace
 from typing import Any, cast
 
+import msgspec
 import pytest
 import zenoh
 
+from daemon.publish.stream.messages import Pose
+from daemon.snapshot import State
 from taps.fleet import robot
 from taps.fleet.claim import Claim
 from taps.fleet.robot import Robot
@@ -45,3 +50,30 @@ def test_a_map_that_is_named_later_is_told_by_its_name(monkeypatch: pytest.Monke
     now[0] += robot.NAME_S
     told._map_name(7)
     assert looked == [2]
+
+
+def test_no_two_poses_of_one_instant_are_published(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cycles without a measurement and late corrections repeat the instant; lost validity is published all the same."""
+    sent: list[tuple[float, bool]] = []
+
+    def publish(key: str, content: bytes, attachment: bytes | None = None) -> None:
+        if key == "pose":
+            told = json.loads(content)
+            sent.append((told["t_utc"], told["agvPosition"]["positionInitialized"]))
+
+    robot_ = Robot(cast(Any, SimpleNamespace(publish=publish)), cast(Any, SimpleNamespace(held=dict)), "maps")
+    monkeypatch.setattr(robot_, "_map_name", lambda map_id: "")
+    pose = Pose(
+        seq=1, t_mono=1.0, t_sent=1.0, t_utc=1001.0, state=State.TRACKING, state_name="TRACKING", reason=0,
+        pose=(1.0, 2.0, 0.0), covariance=(0.01, 0.0, 0.01, 0.0, 0.0, 0.01),
+    )  # fmt: skip
+    for frame in (
+        pose,
+        msgspec.structs.replace(pose, seq=2, t_sent=1.5, t_utc=1001.5),
+        msgspec.structs.replace(pose, seq=3, t_sent=1.6, t_utc=1001.6, pose=(1.5, 2.0, 0.0)),
+        msgspec.structs.replace(pose, seq=4, t_mono=2.0, t_sent=2.0, t_utc=1002.0),
+        msgspec.structs.replace(pose, seq=5, t_mono=2.0, t_sent=2.5, t_utc=1002.5, state=State.LOST, covariance=None),
+    ):
+        robot_.receive(frame)
+        robot_.beat()
+    assert sent == [(1001.0, True), (1002.0, True), (1002.0, False)]

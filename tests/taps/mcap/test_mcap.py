@@ -211,7 +211,7 @@ def test_an_export_that_is_told_to_stop_leaves_nothing_half_made(
     monkeypatch.setattr(export, "_export", stopped)
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as ended:
-        export.main(argparse.Namespace(log=tmp_path, mcap=None, kitti=None, tum=tmp_path / "a.tum"))
+        export.main(argparse.Namespace(log=tmp_path, source=tmp_path, mcap=None, kitti=None, tum=tmp_path / "a.tum"))
     assert ended.value.code == 128 + signal.SIGTERM
     assert list(tmp_path.iterdir()) == []
     assert signal.getsignal(signal.SIGTERM) is before

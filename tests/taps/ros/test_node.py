@@ -82,11 +82,15 @@ def test_the_graph_that_ros2_topic_list_is_made_of(tmp_path: Path) -> None:
         def graph() -> list[str]:
             return [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/0/**", timeout=1.0)]
 
+        pose = Subscriber(session, "/pose")
+
         async def body() -> None:
-            found.extend(await until(lambda: len(tokens := graph()) > len(PUBLISHED) and tokens))
+            found.extend(await until(lambda: pose.got and len(tokens := graph()) > len(PUBLISHED) and tokens))
 
         asyncio.run(beside(body(), serve(made, tmp_path / "s")))
         assert graph() == []
+    (token,) = (token for token in found if "/%pose/" in token)
+    assert {gid for _, (_, _, gid) in pose.got} == {rmw_zenoh.gid_of(token)}
     words = sorted((token.split("/") for token in found), key=lambda one: int(one[4]))
     assert {tuple(one[:4]) for one in words} == {("@ros2_lv", "0", words[0][2], "0")}
     assert words[0][4:] == ["0", "NN", "%", "%", "lumiloop"]

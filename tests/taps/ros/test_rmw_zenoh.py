@@ -74,3 +74,13 @@ def test_publishers_have_names_of_their_own() -> None:
     }
     assert len(gids) == len(TOPICS)
     assert {len(gid) for gid in gids} == {16}
+
+
+def test_a_gid_is_the_hash_that_rmw_zenoh_makes_of_the_token() -> None:
+    """Low half first, each little-endian, as its `liveliness_utils.cpp` copies them (value made by python-xxhash)."""
+    token = (
+        "@ros2_lv/0/4f1c6b0d9a3e2f7785c1d0e9ab34cd56/0/1/MP/%/%agv1/lumiloop/%agv1%pose/"
+        "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_/"
+        "RIHS01_26432f9803e43727d3c8f668d5fdb3c630f548af631e2f4e31382371bfea3b6e/::,10:,:,:,,"
+    )
+    assert rmw_zenoh.gid_of(token).hex() == "d77c1064ce794ac009401af03369e029"

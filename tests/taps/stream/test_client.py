@@ -93,7 +93,7 @@ async def test_every_topic_arrives_with_its_type(tmp_path: Path) -> None:
 def tell_all(server: StreamServer) -> None:
     server.publish(FULL)
     server.on_scan(raw_scan())
-    server.on_faults(2.0, [(104, "no valid scan", "check the cable")])
+    server.on_faults(2.0, [(104, "no valid scan", "check the cable", 0)])
     server.on_statistics(lambda: {"t_mono": 1.0, "cycles": 5, "of_tomorrow": [1]})
     server.on_raw("lidar", "rx", 1.5, b"\x00\xff")
     server.on_samples(RawSamples(1, 0.0, 0.1, 2.0, 22222.2, np.array([1, 513], np.uint16), 12, Blemish(0), 0.0))

@@ -12,6 +12,7 @@ from daemon.health.assessment import REPLAYED
 from daemon.health.faults import FAULTS, Fault
 from daemon.integrity.lamp_monitor import LASTS_S
 from daemon.publish.stream.messages import Faults
+from daemon.replay.sources import open_log
 from taps.stream.recording_source import RecordingSource
 from tests.daemon.replay.test_recorded_lights import Recorded, record
 from tests.daemon.replay.test_recorded_run import pulled
@@ -43,7 +44,9 @@ def dark(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, set[int]]:
 
 def test_an_export_tells_them(dark: tuple[Path, set[int]]) -> None:
     recording, live = dark
-    told = [frame for frame in RecordingSource(recording, Config()).frames(raw=False) if isinstance(frame, Faults)]
+    told = [
+        frame for frame in RecordingSource(open_log(recording), Config()).frames(raw=False) if isinstance(frame, Faults)
+    ]
     assert {one.fault for frame in told for one in frame.present} == live
     (came, *_) = (frame for frame in told if any(one.fault == Fault.NO_LAMPS for one in frame.present))
     (fault,) = (one for one in came.present if one.fault == Fault.NO_LAMPS)
@@ -57,7 +60,7 @@ def test_a_film_shows_them_when_they_were(dark: tuple[Path, set[int]], tmp_path:
     from taps.view.replay_recorder import make
 
     recording, live = dark
-    make(recording, Config(), (False, ()), tmp_path / "film")
+    make(open_log(recording), Config(), (False, ()), tmp_path / "film")
     film = ReplayFile(recording, tmp_path / "film")
     film.refresh()
     assert (film.done, film.error) == (True, "")
@@ -73,7 +76,9 @@ def test_what_devices_said_is_told_as_it_was_published(tmp_path: Path) -> None:
     """A replay has no devices."""
     record_run(tmp_path / "rec", pulled)
     told = [
-        frame for frame in RecordingSource(tmp_path / "rec", Config()).frames(raw=False) if isinstance(frame, Faults)
+        frame
+        for frame in RecordingSource(open_log(tmp_path / "rec"), Config()).frames(raw=False)
+        if isinstance(frame, Faults)
     ]
     assert [any(one.fault == Fault.LIDAR_MISSING for one in frame.present) for frame in told] == [True, False]
     came, gone = (frame.t_mono for frame in told)

@@ -106,7 +106,7 @@ async def serving(
     source = None if film is not None else Stream(path, TOPICS)
     view = View(guard or Guard("127.0.0.1"), scene or Scene("agv"), source, film, ("127.0.0.1", modbus), again)
     await until(path.is_socket)
-    runner = web.AppRunner(view.app(), access_log=None, shutdown_timeout=0.1)
+    runner = view.runner(0.1)
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", 0).start()
     if film is None:

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from daemon.config.schema import Config
+from daemon.replay.sources import open_log
 from taps.view import command
 from taps.view.replay_file import HEAD, KINDS, ReplayFile
 from taps.view.replay_player import ReplayPlayer
@@ -173,7 +174,7 @@ async def test_a_page_that_talks_nonsense(film: ReplayFile, words: object) -> No
 
 def test_a_recording_is_shown_from_its_beginning_and_takes_no_orders(recording: Path, tmp_path: Path) -> None:
     file = tmp_path / "film"
-    make(recording, Config(), (False, ()), file)
+    make(open_log(recording), Config(), (False, ()), file)
     film = ReplayFile(recording, file)
     film.refresh()
     assert (film.done, film.error) == (True, "")
@@ -204,7 +205,7 @@ def test_a_recording_is_shown_from_its_beginning_and_takes_no_orders(recording: 
 def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
     log, file = tmp_path / "log.clf", tmp_path / "film"
     log.write_text("nothing of use\n")
-    make(log, Config(), (False, ()), file)
+    command._record(log, Config(), (False, ()), file)
     film = ReplayFile(log, file)
     film.refresh()
     assert film.done

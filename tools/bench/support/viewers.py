@@ -29,7 +29,7 @@ Body = Callable[[], Awaitable[None]]
 
 async def serve(stream: Path, port: int) -> None:
     """The page's server, until it is cancelled."""
-    runner = web.AppRunner(View(Guard("127.0.0.1"), Scene("bench"), Stream(stream, TOPICS)).app(), access_log=None)
+    runner = View(Guard("127.0.0.1"), Scene("bench"), Stream(stream, TOPICS)).runner()
     await runner.setup()
     try:
         await web.TCPSite(runner, "127.0.0.1", port).start()

@@ -17,6 +17,7 @@ from typing import Final
 
 from daemon.config.schema import Config
 from daemon.replay.log_replay import Outcome, replay
+from daemon.replay.sources import open_log
 from estimator.paper import METHODS
 from tools.bench import crispness
 from tools.ci.figures import Figure
@@ -54,7 +55,7 @@ def simulated(seconds: float) -> Rows:
     with tempfile.TemporaryDirectory() as folder:
         harness.run(seconds, scene=scene, record=Path(folder))
         for name in METHODS:
-            outcome = replay(Path(folder), Config(), method=name)
+            outcome = replay(open_log(Path(folder)), Config(), method=name)
             live = judged(outcome, scene, name, min(FROM_S, 0.5 * seconds))
             lengths = [100.0 * value for value in (live.rmse, live.largest, live.end)]
             rows.append((name, *lengths, live.heading, _ms(outcome)))
@@ -72,7 +73,7 @@ def intel(log: Path) -> Rows:
     """Mean errors of relations, within and beyond 30 s: a row for each method."""
     relations, rows = read_relations(log.with_suffix(".relations")), Rows()
     for name in METHODS:
-        outcome = replay(log.with_suffix(".clf.gz"), Config(), method=name)
+        outcome = replay(open_log(log.with_suffix(".clf.gz")), Config(), method=name)
         final = outcome.rerun.ledger.final()
         found = evaluate(final.stamps, final.poses, relations)
         near, far = found.within(SPLIT_S), found.beyond(SPLIT_S)

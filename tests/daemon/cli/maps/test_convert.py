@@ -21,6 +21,7 @@ from daemon.maps.image import image_from, meta_of, packed
 from daemon.maps.image_geometry import grid_of, placed
 from daemon.maps.store import Store
 from daemon.replay.log_replay import replay
+from daemon.replay.sources import open_log
 from daemon.system import console
 from estimator.mapping.keyframe import Keyframe
 from estimator.mapping.map_snapshot import Identity, MapImage
@@ -99,7 +100,7 @@ def test_tum_has_every_keyframe_where_it_lies(file: Path, tmp_path: Path, capsys
 
 def test_our_replay_finds_the_same_room_in_the_carmen_log(file: Path, tmp_path: Path) -> None:
     assert run("export", file, "--carmen", "--out", tmp_path / "out") == console.OK
-    outcome = replay(tmp_path / "out" / "keyframes.clf", Config())
+    outcome = replay(open_log(tmp_path / "out" / "keyframes.clf"), Config())
     assert outcome.stopped == ""
     frames = keyframes_of(file)
     assert outcome.source.status.scans == len(frames)
@@ -281,3 +282,13 @@ def test_a_place_that_cannot_be_written_is_named(
     assert parser.main(["map", "name", str(file), "hall", "--out", str(out)]) == console.FAILED
     said = capsys.readouterr().err
     assert f"{out}: cannot be written: No such file or directory; name another place with --out FILE" in said
+
+
+def test_a_drawing_of_more_floor_than_can_be_imported_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.fromarray(np.full((250, 250), 254, np.uint8)).save(tmp_path / "map.pgm")
+    (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 1.0\norigin: [0, 0, 0]\n")
+    assert run("import", tmp_path / "map.yaml", "--out", tmp_path / "new.lumimap") == console.FAILED
+    assert "has 62500 m2 of free floor; at most 50000 can be imported" in capsys.readouterr().err
+    assert not (tmp_path / "new.lumimap").exists()

@@ -73,3 +73,17 @@ def test_no_two_blocks_have_one_magic_number() -> None:
         f'0x{parts_block.BLOCK.magic:04X} ("{parts_block.BLOCK.magic.to_bytes(2, "big").decode()}")'
         in document.modbus_page()
     )
+
+
+def test_status_shows_what_follows_from_a_fault_below_it() -> None:
+    slow = Condition(faults=(104, 306, 106, 301, 401))
+    reading = registers.decode_block(registers.encode_block(snapshot(fault=104)))
+    reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(snapshot()))
+    reading |= parts_block.BLOCK.decode(parts_block.BLOCK.encode(snapshot(condition=slow)))
+    lines = status_table.as_table(reading, False).splitlines()
+    first = next(place for place, line in enumerate(lines) if line.startswith("fault"))
+    shown = [line[10:] for line in lines[first : first + 5]]
+    assert [line.split(":")[0] for line in shown] == [" 104", " 306", "   follows", "   follows", " 401"]
+    assert "106: more than 2 % of the lidar's scans" in shown[2]
+    assert "take load off" not in shown[3], "the remedy is that of the cause"
+    assert status_table.as_object(reading, False)["fault_causes"] == {"106": 306, "301": 306}

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from daemon.publish.modbus import registers
 from daemon.publish.modbus.holding import COMMAND, CommandCode, Holding, Outcome, Request, WrittenOdometry
 from daemon.publish.modbus.requests import Responder, frame_size
+from daemon.system.versions import release
 from tests.daemon.publish.modbus.test_registers import snapshot
 
 
@@ -71,7 +72,7 @@ def test_reads_outside_are_exceptions(function: int, address: int, count: int, c
     assert Bench().ask(read(function, address, count)) == bytes([function | 0x80, code])
 
 
-@pytest.mark.parametrize("function", [0, 1, 2, 5, 7, 8, 15, 17, 20, 22, 23, 24, 43, 90, 127, 128, 132, 255])
+@pytest.mark.parametrize("function", [0, 1, 2, 5, 7, 8, 15, 17, 20, 22, 24, 90, 127, 128, 132, 255])
 def test_other_functions_are_illegal(function: int) -> None:
     assert Bench().ask(bytes([function, 0, 0, 0, 1])) == bytes([function | 0x80, 1])
     assert Bench().ask(bytes([function])) == bytes([function | 0x80, 1])
@@ -271,3 +272,90 @@ def test_the_first_request_is_1_and_0_is_one_after_the_numbers_have_wrapped() ->
         else:
             assert struct.unpack(">HH", holding.read(1008, 2)) == (0, Outcome.NONE)
     assert "Begin with 1" in next(point.text for point in COMMAND.points if point.name == "request")
+
+
+def read_write(address: int, count: int, to: int, *words: int) -> bytes:
+    return struct.pack(f">BHHHHB{len(words)}H", 23, address, count, to, len(words), 2 * len(words), *words)
+
+
+def test_a_write_that_reads_too_writes_first() -> None:
+    bench = Bench()
+    asked = [7, CommandCode.SAVE_MAP, *[0] * 6]
+    answer = bench.ask(read_write(1000, 10, 1000, *asked))
+    assert answer[:2] == b"\x17\x14"
+    assert struct.unpack(">10H", answer[2:]) == (*asked, 0, Outcome.RUNNING)
+    assert [(one.number, one.code) for one in bench.commands] == [(7, CommandCode.SAVE_MAP)]
+    assert bench.ask(read_write(0, 64, 1050, 5)) == bytes([23, 128]) + bench.block
+    assert bench.loops == [5]
+
+
+@pytest.mark.parametrize(
+    ("body", "exception"),
+    [
+        (read_write(63, 2, 1050, 5), 2),  # what is to be read is not there: nothing is written
+        (read_write(0, 64, 1051, 5), 2),
+        (read_write(0, 0, 1050, 5), 3),
+        (read_write(0, 126, 1050, 5), 3),
+        (read_write(0, 4, 1050), 3),
+        (read_write(0, 4, 1050, 5) + b"\0", 3),
+        (read_write(0, 4, 1050, 5)[:-1], 3),
+        (b"\x17", 3),
+    ],
+)
+def test_a_write_that_reads_too_is_carried_out_as_a_whole_or_not(body: bytes, exception: int) -> None:
+    bench = Bench()
+    assert bench.ask(body) == bytes([0x97, exception])
+    assert (bench.loops, bench.commands) == ([], [])
+
+
+def test_the_largest_write_that_reads_too_is_that_of_the_standard() -> None:
+    asked = [bytes([0x97, 2]), bytes([0x97, 3])]  # 121 registers are a write to what is not there
+    assert [Bench().responder.answer_body(read_write(0, 4, 1000, *[0] * count)) for count in (121, 122)] == asked
+
+
+def test_without_writing_there_is_no_function_that_writes() -> None:
+    assert Bench(write=False).ask(read_write(0, 4, 1050, 5)) == b"\x97\x01"
+
+
+def objects_in(answer: bytes) -> dict[int, bytes]:
+    """Objects of a reply to function 43, MEI type 14, with its head checked."""
+    head, count, rest = answer[:7], answer[6], answer[7:]
+    assert (head[:2], head[3:6]) == (b"\x2b\x0e", b"\x82\x00\x00"), "regular objects, nothing follows"
+    found: dict[int, bytes] = {}
+    while rest:
+        found[rest[0]], rest = rest[2 : 2 + rest[1]], rest[2 + rest[1] :]
+    assert len(found) == count
+    return found
+
+
+@pytest.mark.parametrize(
+    ("access", "first", "found"),
+    [(1, 0, [0, 1, 2]), (2, 0, range(7)), (3, 0, range(7)), (2, 4, [4, 5, 6]), (1, 4, [0, 1, 2]), (3, 0x80, range(7)),
+     (4, 6, [6]), (4, 2, [2])],
+)  # fmt: skip
+def test_the_device_is_identified(access: int, first: int, found: list[int]) -> None:
+    told = objects_in(Bench().ask(bytes([43, 14, access, first])))
+    assert list(told) == list(found)
+    assert all(text and text.isascii() for text in told.values())
+
+
+def test_the_names_in_the_identification() -> None:
+    responder = Responder(name="agv-11")
+    told = objects_in(responder.answer_body(bytes([43, 14, 3, 0])))
+    assert (told[1], told[2], told[6]) == (b"lumiloop", release().encode(), b"agv-11")
+
+
+@pytest.mark.parametrize(
+    ("body", "exception"),
+    [
+        (bytes([43, 14, 4, 7]), 2),
+        (bytes([43, 14, 0, 0]), 3),
+        (bytes([43, 14, 5, 0]), 3),
+        (bytes([43, 14, 1]), 3),
+        (bytes([43, 14, 1, 0, 0]), 3),
+        (bytes([43]), 3),
+        (bytes([43, 13, 1, 0]), 1),  # CANopen
+    ],
+)
+def test_what_is_no_question_for_the_identification(body: bytes, exception: int) -> None:
+    assert Bench().ask(body) == bytes([0xAB, exception])

@@ -90,7 +90,7 @@ async def test_a_block_over_a_pseudo_terminal() -> None:
         for _ in range(5):
             os.write(ours, asked())
             assert await answer(ours, 133) == asked(b"\x04\x80" + block)
-        os.write(ours, asked(b"\x2b\x0e\x01\x00"))
+        os.write(ours, asked(b"\x2b\x0d\x01\x00"))
         assert await answer(ours, 5) == asked(b"\xab\x01"), "an exception for what is not served"
         assert (server.requests, server.unsent) == (6, 0)
 

@@ -186,7 +186,10 @@ async def test_a_turn_serves_at_most_64_requests(monkeypatch: pytest.MonkeyPatch
     per_turn: list[int] = []
     async with publishing() as publisher:
         loop = asyncio.get_running_loop()
-        links = [await asyncio.open_connection("127.0.0.1", publisher.port) for _ in range(counts.MAX_CONNECTIONS)]
+        links = [
+            await asyncio.open_connection("127.0.0.1", publisher.port, local_addr=(f"127.0.0.{1 + n % 2}", 0))
+            for n in range(counts.MAX_CONNECTIONS)
+        ]
         senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
         for _, writer in links:
             writer.write(b"".join(request(n, 4, 0, 1) for n in range(100)))

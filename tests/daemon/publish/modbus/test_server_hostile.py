@@ -18,6 +18,7 @@ from hal.clock import SystemClock, run_virtual
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import (
     BLOCK,
+    Wire,
     closed,
     plugged,
     publishing,
@@ -272,17 +273,60 @@ def test_a_full_house_drops_the_longest_idle_or_refuses(caplog: pytest.LogCaptur
     caplog.set_level(logging.INFO)
 
     async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
-        house = [plugged(endpoint) for _ in range(counts.MAX_CONNECTIONS)]
-        _, refused = plugged(endpoint)
+        house = [plugged(endpoint, f"192.0.2.{n % 2}") for n in range(counts.MAX_CONNECTIONS)]
+        _, refused = plugged(endpoint, "192.0.2.1")
         assert refused.gone
         assert endpoint.counts.refused == 1
         await asyncio.sleep(tcp_endpoint.EVICT_S + 1.0)
         for connection, _ in house[:5] + house[6:]:
             connection.data_received(request(1, *BLOCK))
-        _, admitted = plugged(endpoint)
+        _, admitted = plugged(endpoint, "192.0.2.1")
         assert not admitted.gone
         assert [number for number, (_, wire) in enumerate(house) if wire.gone] == [5]
         assert endpoint.counts.connections == counts.MAX_CONNECTIONS
 
     in_virtual_time(body)
     assert [record.message.partition(" is ")[2] for record in caplog.records] == [counts.CROWDED.removeprefix("is ")]
+
+
+def served(connection: tcp_endpoint.Connection, wire: Wire) -> bool:
+    """Whether a request is answered now."""
+    before = len(wire.sent)
+    if not wire.gone:
+        connection.data_received(request(1, *BLOCK))
+    return len(wire.sent) > before
+
+
+def test_one_host_never_takes_all_connections(caplog: pytest.LogCaptureFixture) -> None:
+    """However often it connects and asks, another one is served; its own idle connections make place for it."""
+    caplog.set_level(logging.INFO)
+
+    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+        flood = [plugged(endpoint, "192.0.2.9") for _ in range(2 * counts.MAX_CONNECTIONS)]
+        assert sum(served(*one) for one in flood) == endpoint.counts.connections == counts.PER_HOST == 24
+        honest = [plugged(endpoint, f"192.0.2.{n}") for n in range(8)]
+        assert all(served(*one) for one in honest)
+        assert endpoint.counts.connections == counts.MAX_CONNECTIONS
+        await asyncio.sleep(tcp_endpoint.EVICT_S + 1.0)
+        for one in (*flood[1:], *honest):
+            served(*one)
+        late = plugged(endpoint, "::ffff:192.0.2.9")
+        assert served(*late)
+        assert flood[0][1].gone
+        assert all(served(*one) for one in honest)
+
+    in_virtual_time(body)
+    assert any("it has 24 of the 32 connections" in record.message for record in caplog.records)
+
+
+def test_in_a_full_house_the_host_with_most_makes_place_for_another_one() -> None:
+    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+        house = [plugged(endpoint, f"2001:db8:0:{n % 2}::{n + 1:x}") for n in range(counts.MAX_CONNECTIONS)]
+        assert all(served(*one) for one in house)
+        others = [plugged(endpoint, f"192.0.2.{n}") for n in range(40)]
+        assert all(served(*one) for one in others[:30])
+        assert not any(served(*one) for one in others[30:])
+        for subnet in (0, 1):
+            assert sum(not wire.gone for _, wire in house[subnet::2]) == 1
+
+    in_virtual_time(body)

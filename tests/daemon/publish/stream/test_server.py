@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import os
 import re
 import socket
@@ -241,6 +242,8 @@ async def test_many_requests_at_once_are_taken_a_few_at_a_time(monkeypatch: pyte
 
 async def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream_session, "CLIENTS", 2)
+    processes = itertools.count(1)
+    monkeypatch.setattr(stream_session, "credentials", lambda _: (next(processes),) * 2)
 
     async with running(tmp_path / "stream") as server:
         taps = [await connected(server) for _ in range(2)]
@@ -249,6 +252,26 @@ async def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.
         taps[0].writer.close()
         await until(lambda: len(server.clients) < 2)
         await connected(server)
+
+
+async def test_one_program_and_one_user_never_have_all_places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def refused(server: StreamServer) -> str:
+        tap = Tap(*await asyncio.open_unix_connection(str(server.path)))
+        return str((await tap.frame())["text"])
+
+    async with running(tmp_path / "stream") as server:
+        for _ in range(16):
+            await connected(server)
+        assert {(client.process, client.user) for client in server.clients} == {(os.getpid(), os.geteuid())}
+        assert await refused(server) == "this program has 16 of the 32 places; close one"
+        monkeypatch.setattr(stream_session, "credentials", lambda _: (1, os.geteuid()))
+        for _ in range(8):
+            await connected(server)
+        assert await refused(server) == "this user's programs have 24 of the 32 places; close one"
+        monkeypatch.setattr(stream_session, "credentials", lambda _: (2, 1 + os.geteuid()))
+        for _ in range(8):
+            await connected(server)
+        assert await refused(server) == "32 clients are being served; close one"
 
 
 async def test_a_path_left_by_a_dead_program_is_taken(tmp_path: Path) -> None:
@@ -300,7 +323,7 @@ async def test_the_reference_client_reads_it(tmp_path: Path) -> None:
     async with running(tmp_path / "stream") as server:
         command = [str(ROOT / "tools/clients/watch_stream.py"), str(server.path), "pose", "scan", "state", "faults"]
         server.publish(SNAPSHOT)
-        server.on_faults(1.0, [(104, "no valid scan", "check the cable")])
+        server.on_faults(1.0, [(104, "no valid scan", "check the cable", 0)])
         process = await asyncio.create_subprocess_exec(sys.executable, *command, stdout=asyncio.subprocess.PIPE)
         assert process.stdout is not None
         hello = await asyncio.wait_for(process.stdout.readline(), 10.0)

@@ -24,7 +24,8 @@ from tests.daemon.publish.stream.test_server import Tap, connected, running, unt
 from tests.daemon.runtime.test_cycle import on_bench
 from tests.daemon.support.room import HALF_X, HALF_Y, ranges_m
 
-SILENT = (104, "no valid scan", "check the cable")
+SILENT = (104, "no valid scan", "check the cable", 0)
+STALLED = (301, "stalled", "", 306)
 
 
 async def test_faults_are_told_at_first_and_when_they_change(tmp_path: Path) -> None:
@@ -33,7 +34,10 @@ async def test_faults_are_told_at_first_and_when_they_change(tmp_path: Path) -> 
         tap = await wanting(server, "faults")
         first = await tap.frame()
         assert [one["fault"] for one in first["data"]["present"]] == [104]
-        server.on_faults(2.0, [SILENT])
+        server.on_faults(1.5, [SILENT, STALLED])
+        second = await tap.frame()
+        assert [(one["fault"], one["cause"]) for one in second["data"]["present"]] == [(104, 0), (301, 306)]
+        server.on_faults(2.0, [SILENT, STALLED])
         server.on_faults(3.0, [])
         over = await tap.frame()
         assert over["data"] == {"t_mono": 3.0, "present": []}

@@ -225,6 +225,7 @@ def test_clip() -> None:
     ("table", "says"),
     [
         ({"what": "dc_off"}, "no DC channel"),
+        ({"what": "foreign"}, "no DC channel"),
         ({"what": "moved", "address": 0x4D}, "a chip already"),
     ],
 )

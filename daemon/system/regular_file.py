@@ -1,0 +1,76 @@
+"""Reading of files that may be anything: bounded in size, tried again after a failure, and without waiting for a FIFO.
+
+A start reads its files with this. A read that fails once, as on a worn memory card, does not end it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import time
+from pathlib import Path
+from typing import Final
+
+TRIES: Final = 3
+PAUSE_S: Final = 0.05
+"""Pause in s before another try."""
+LASTING: Final = frozenset(
+    (
+        *(errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO, errno.ENODEV),
+        *(errno.EINVAL, errno.EFBIG, errno.EISDIR),
+    )
+)
+"""Errors that another try does not change."""
+OPEN_ALREADY: Final = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/")
+"""Paths of what the caller has opened, as a shell does for ``<(command)``: a pipe is welcome there."""
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """Content of a regular file of at most ``most_bytes``.
+
+    Raises:
+        OSError: it cannot be read, is no regular file, or is larger.
+    """
+    for _ in range(TRIES - 1):
+        try:
+            return _read(path, most_bytes)
+        except OSError as error:
+            if error.errno in LASTING:
+                raise
+        time.sleep(PAUSE_S)
+    return _read(path, most_bytes)
+
+
+def read_named(path: Path, most_bytes: int) -> bytes:
+    """As :func:`read_regular`, for a file that an operator names: it may also be a pipe that is open already."""
+    if not str(path).startswith(OPEN_ALREADY):
+        return read_regular(path, most_bytes)
+    with path.open("rb") as file:
+        content = file.read(most_bytes + 1)
+    return _bounded(path, content, len(content), most_bytes)
+
+
+def _read(path: Path, most_bytes: int) -> bytes:
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    try:
+        about = os.fstat(handle)
+        if stat.S_ISDIR(about.st_mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if not stat.S_ISREG(about.st_mode):
+            raise OSError(errno.EINVAL, f"it is {_kind_of(about.st_mode)}, and no regular file", str(path))
+        with os.fdopen(handle, "rb", closefd=False) as file:
+            content = b"" if about.st_size > most_bytes else file.read(most_bytes + 1)
+    finally:
+        os.close(handle)
+    return _bounded(path, content, max(about.st_size, len(content)), most_bytes)
+
+
+def _bounded(path: Path, content: bytes, size: int, most_bytes: int) -> bytes:
+    if size > most_bytes:
+        raise OSError(errno.EFBIG, f"it is larger than {most_bytes} bytes", str(path))
+    return content
+
+
+def _kind_of(mode: int) -> str:
+    return "a FIFO" if stat.S_ISFIFO(mode) else "a device"
