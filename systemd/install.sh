@@ -44,7 +44,7 @@ environment() {
     "$PYTHON" -m venv "$ROOT"
     "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r "$SOURCE/requirements/core.lock"
     wheel=$(mktemp -d)
-    tar -C "$SOURCE" -cf - pyproject.toml README.md LICENSE daemon hal estimator taps | tar -C "$wheel" -xf -
+    tar -C "$SOURCE" -cf - pyproject.toml README.md LICENSE daemon hal estimator taps tools/__init__.py tools/demo tools/sim | tar -C "$wheel" -xf -
     PIP_CONSTRAINT="$SOURCE/requirements/build.txt" "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --no-deps "$wheel"
     rm -rf "$wheel"
     "$ROOT/bin/python" -m pip uninstall --quiet --disable-pip-version-check --yes setuptools pip

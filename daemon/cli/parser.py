@@ -13,6 +13,7 @@ from typing import Final
 
 from daemon.cli import tap_parsers
 from daemon.cli.command_body import Body, config_arguments, estimating, later, loaded
+from daemon.cli.orders import parsers as order_parsers
 from daemon.system.console import INTERRUPTED, OK, USAGE, fail
 from estimator.paper import LUMILOOP, METHODS
 
@@ -64,6 +65,7 @@ def parser() -> argparse.ArgumentParser:
     _survey(commands.add_parser("survey", help="where the lamps hang, from a recorded drive"))
     _warm(commands.add_parser("warm", help="compile the kernels of this version now, and not at the first start"))
     _codes(commands.add_parser("codes", help="print the code tables for those who build lamps"))
+    order_parsers.add(commands)
     tap_parsers.add(commands)
     return parser
 
