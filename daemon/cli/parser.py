@@ -13,6 +13,7 @@ from typing import Final
 
 from daemon.cli import tap_parsers
 from daemon.cli.command_body import Body, config_arguments, estimating, later, loaded
+from daemon.cli.config import parsers as config_parsers
 from daemon.cli.orders import parsers as order_parsers
 from daemon.system.console import INTERRUPTED, OK, USAGE, fail
 from estimator.paper import LUMILOOP, METHODS
@@ -54,6 +55,7 @@ def parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     _run(commands.add_parser("run", help="read the sensors, publish the pose, until stopped"))
     _check(commands.add_parser("check", help="say whether a configuration file, and the survey it names, are good"))
+    config_parsers.add(commands)
     _probe(commands.add_parser("probe", help="find lidars and photodiode converters and say what they are"))
     _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
     _convert(commands.add_parser("convert", help="turn recorded lidar data of other formats into a log for replay"))
@@ -115,8 +117,10 @@ def _recording(body: Body) -> Body:
 
 
 def _check(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("config", type=Path, metavar="FILE", help="configuration file (TOML)")
-    config_arguments(parser, file=False)
+    parser.add_argument(
+        "file", nargs="?", type=Path, metavar="FILE", help="configuration file (TOML); the same as --config FILE"
+    )
+    config_arguments(parser)
     parser.set_defaults(body=loaded("daemon.cli.check", "main"))  # it resolves the configuration itself
 
 
