@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from daemon.cli.command_body import find_config
+from daemon.cli.reports.output import print_report
 from daemon.config import loader
 from daemon.config.schema import Config
 from daemon.diagnosis.configuration import examine
@@ -33,7 +34,12 @@ def main(args: argparse.Namespace) -> int:
         sys.stdout.write(loader.dump(settings))
         return console.OK
     remarks = [] if settings is None else examine(settings, file, gone, wrong)
+    code = max((code for code, _ in wrong), default=console.OK)
+    if args.json:
+        texts = [text for _, text in wrong]
+        print_report("check", {"file": str(file), "good": not wrong, "problems": texts, "remarks": remarks})
+        return code
     if wrong:
-        return console.fail("\n".join(text for _, text in wrong), max(code for code, _ in wrong))
+        return console.fail("\n".join(text for _, text in wrong), code)
     sys.stdout.write("".join(f"{line}\n" for line in (f"{file}: good", *remarks)))
     return console.OK

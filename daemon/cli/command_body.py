@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.system.console import OK, USAGE, fail, say
+from daemon.system.console import OK, USAGE, fail, note
 from daemon.system.extras import how_to_install
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def estimating(module: str, name: str, what: str = "warm") -> Body:
         from daemon.runtime import warmup
 
         try:
-            warmup.load_aloud(say, what, warmup.load, module)
+            warmup.load_aloud(note, what, warmup.load, module)
         except warmup.CannotLoad as error:
             return fail(str(error))
         return loaded(module, name)(args)
@@ -69,7 +69,7 @@ def find_config(args: argparse.Namespace) -> Source:
 
     source = args.source = discovery.find(args.config)
     if source.file is not None and not source.named:
-        say(f"configuration {source}")
+        note(f"configuration {source}")
     return source
 
 

@@ -181,6 +181,7 @@ def _plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("plan"), metavar="DIR", help="for lights.toml and plan.png; plan"
     )
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
     config_arguments(parser)
     parser.set_defaults(body=later("daemon.cli.plan", "main"))
 
