@@ -15,8 +15,8 @@ from typing import Final
 from daemon.publish.command_messages import LONGEST_REQUEST, BadRequest, reply_line, request_of
 from daemon.publish.commands import OnEnd
 from daemon.publish.local_socket import listening
-from daemon.publish.modbus.holding import Outcome, Request
-from daemon.snapshot import Snapshot
+from daemon.publish.modbus.holding import CommandCode, Outcome, Request
+from daemon.snapshot import GUESSED, Snapshot
 from hal.net.fair_share import Share
 
 log = logging.getLogger(__name__)
@@ -52,8 +52,11 @@ class CommandSocket:
         self.share = Share()
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Sink of the cycle: keep the latest snapshot."""
+        """Sink of the cycle: keep the latest snapshot, and answer the clients whose search has ended."""
         self.latest = snapshot
+        if snapshot.state not in GUESSED:
+            for client in [client for client in self.clients if client.searching]:
+                client.answer(Outcome.DONE, "")
 
     async def run(self) -> None:
         """Serve until cancelled; raises `DeviceRefused` where another program serves it, or it cannot be made."""
@@ -78,9 +81,10 @@ class CommandSocket:
 
 
 class Client(asyncio.Protocol):
-    """One connection."""
+    """One connection; ``searching``: its command is carried out once the place of the robot is known."""
 
     def __init__(self, server: CommandSocket) -> None:
+        self.searching = False
         self._server = server
         self._transport: asyncio.Transport | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -142,7 +146,17 @@ class Client(asyncio.Protocol):
             return
         self._command = request.code.name.lower()
         self._wait(ANSWER_S, Outcome.RUNNING, f"not finished after {ANSWER_S:g} s")
-        self._server.handle(request, self.answer, SOURCE)
+        self._server.handle(
+            request, self._search_ended if request.code is CommandCode.RELOCALISE else self.answer, SOURCE
+        )
+
+    def _search_ended(self, outcome: Outcome, reason: str) -> None:
+        """The search has begun; its end is the first snapshot whose state has a confirmed place."""
+        latest = self._server.latest
+        if outcome is Outcome.DONE and (latest is None or latest.state in GUESSED):
+            self.searching = True
+        else:
+            self.answer(outcome, reason)
 
     def _wait(self, seconds: float, outcome: Outcome, reason: str) -> None:
         """Answer thus if nothing else does within that time."""
@@ -152,7 +166,7 @@ class Client(asyncio.Protocol):
 
     def answer(self, outcome: Outcome, reason: str) -> None:
         """Send the reply and close; nothing where the client has gone or has its reply."""
-        transport, self._transport = self._transport, None
+        transport, self._transport, self.searching = self._transport, None, False
         if transport is not None:
             if self._timer is not None:  # a client that does not read its reply is closed all the same
                 self._timer.cancel()

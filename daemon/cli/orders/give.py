@@ -9,6 +9,7 @@ import argparse
 import json
 import math
 import sys
+import time
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,10 +17,13 @@ from daemon.cli.orders.local import NotGiven, give
 from daemon.config.schema import Config
 from daemon.publish.command_messages import FARTHEST_M, SCHEMA
 from daemon.publish.modbus.holding import CommandCode, Request
+from daemon.snapshot import GUESSED, State
 from daemon.system.console import FAILED, OK, USAGE, fail
 
+POLL_S: Final = 0.2
+"""Period at which the end of a search is looked for over Modbus, s."""
 DONE: Final = {
-    CommandCode.SET_POSE: "pose set",
+    CommandCode.SET_POSE: "pose set",  # whether it is right, the state says
     CommandCode.RELOCALISE: "position found",
     CommandCode.SAVE_MAP: "map saved and read back",
     CommandCode.SWITCH_MAP: "map switched",
@@ -105,17 +109,29 @@ def _by_modbus(address: str, settings: Config, request: Request, longest_s: floa
     """Give an order over Modbus UDP; the reason of a refusal is in the daemon's log only."""
     import asyncio
 
+    from daemon.cli.reports.output import name_of
     from daemon.cli.status import address_of
     from daemon.publish.modbus import command_client
-    from daemon.publish.modbus.client import NoAnswer
+    from daemon.publish.modbus.client import NoAnswer, Reader
 
+    end = time.monotonic() + longest_s
     try:
         host, port = address_of(address, settings)
         result = asyncio.run(command_client.give(host, port, request, None, longest_s))
+        with Reader(host, port) as reader:
+            reading = reader.read()
+            while result == "done" and request.code is CommandCode.RELOCALISE and reading["state"] in GUESSED:
+                if time.monotonic() > end:
+                    result = "no end seen"
+                time.sleep(POLL_S)
+                reading = reader.read()
     except (NoAnswer, command_client.CommandRefused) as error:
         raise NotGiven(str(error)) from None
     reason = f"the log of the daemon at {host}:{port} says why" if result == "refused" else ""
-    return {"schema": SCHEMA, "command": request.code.name.lower(), "result": result, "reason": reason}
+    reply = {"schema": SCHEMA, "command": request.code.name.lower(), "result": result, "reason": reason}
+    names = ("x_m", "map_x"), ("y_m", "map_y"), ("yaw_rad", "map_yaw")
+    pose = None if reading["map_x"] is None else {name: reading[register] for name, register in names}
+    return reply | {"state": name_of(State, reading["state"]), "map_id": reading["map_id"], "pose": pose}
 
 
 def _state(reply: dict[str, Any]) -> str:
@@ -123,6 +139,8 @@ def _state(reply: dict[str, Any]) -> str:
     if "state" not in reply:
         return ""
     said = f"; state {reply['state']}"
+    if reply["state"] in (state.name for state in GUESSED):
+        said += " (the place is not confirmed yet)"
     if (pose := reply.get("pose")) is not None:
         said += f", x {pose['x_m']:.3f} m, y {pose['y_m']:.3f} m, yaw {math.degrees(pose['yaw_rad']):.2f} deg"
     return said

@@ -6,7 +6,10 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from enum import IntEnum
 from typing import Any
+
+from daemon.publish.modbus.points import Value
 
 
 def print_report(command: str, content: Mapping[str, Any], version: int = 1, indent: int | None = None) -> None:
@@ -35,3 +38,13 @@ def pose(values: Sequence[float | None]) -> dict[str, float] | None:
 def zoned(utc: float | None) -> str | None:
     """A time in seconds since the Unix epoch as ISO 8601 in UTC; None stays None."""
     return None if utc is None else datetime.fromtimestamp(utc, UTC).isoformat(timespec="milliseconds")
+
+
+def name_of(table: type[IntEnum], number: Value) -> str | None:
+    """The name of a number; that of a newer daemon is the number itself."""
+    if number is None:
+        return None
+    try:
+        return table(int(number)).name
+    except ValueError:
+        return str(int(number))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Any, Final
 
-from daemon.cli.reports.output import meaning, pose, zoned
+from daemon.cli.reports.output import meaning, name_of, pose, zoned
 from daemon.publish.modbus import integrity_block, parts_block, registers, timing_block
 from daemon.publish.modbus.client import Reading
-from daemon.publish.modbus.points import Value
 from daemon.snapshot import LISTED_LINKS, LightFix, LinkUse, LoopReason, Stage, State
 
 AXES: Final = ("x", "y", "yaw")
@@ -17,7 +15,7 @@ AXES: Final = ("x", "y", "yaw")
 def as_object(reading: Reading, stalled: bool, process: int = 0) -> dict[str, Any]:
     """Returns the reading as nested objects; None: not known. ``process``: that serves it, 0: not known."""
     return {
-        "state": _name(State, reading["state"]),
+        "state": name_of(State, reading["state"]),
         "reason": meaning("reason", int(reading["reason"] or 0)),
         "faults": [meaning("fault", number) for number in _faults(reading)],
         "snapshot": {
@@ -61,16 +59,6 @@ def _pose(reading: Reading, frame: str) -> dict[str, float] | None:
     return pose([reading[f"{frame}_{axis}"] for axis in AXES])
 
 
-def _name(table: type[IntEnum], number: Value) -> str | None:
-    """The name of a number; that of a newer daemon is the number itself."""
-    if number is None:
-        return None
-    try:
-        return table(int(number)).name
-    except ValueError:
-        return str(int(number))
-
-
 def _loops(reading: Reading) -> dict[str, Any]:
     return {
         "count": reading["loop_counter"],
@@ -79,7 +67,7 @@ def _loops(reading: Reading) -> dict[str, Any]:
         else {
             "keyframe_new": reading["loop_new"],
             "keyframe_old": reading["loop_old"],
-            "reason": _name(LoopReason, reading.get("loop_reason")),
+            "reason": name_of(LoopReason, reading.get("loop_reason")),
             "residual_m": reading.get("loop_residual"),
         },
     }
@@ -108,7 +96,7 @@ def _lights(reading: Reading) -> dict[str, Any] | None:
         return found
     links = [_link(reading, row) for row in range(1, LISTED_LINKS + 1) if reading[f"link_{row}_code"] is not None]
     return found | {
-        "fix": _name(LightFix, reading["light_fix"]),
+        "fix": name_of(LightFix, reading["light_fix"]),
         "used": reading["light_used"],
         "pose": _pose(reading, "light"),
         "sigma": _pose(reading, "light_sigma"),
@@ -125,7 +113,7 @@ def _link(reading: Reading, row: int) -> dict[str, Any]:
     return {
         "code": reading[f"link_{row}_code"],
         "lamp": reading[f"link_{row}_lamp"],
-        "use": _name(LinkUse, reading[f"link_{row}_use"]),
+        "use": name_of(LinkUse, reading[f"link_{row}_use"]),
         "strength_a": reading[f"link_{row}_strength"],
         "residual_ln": reading[f"link_{row}_residual"],
     }
@@ -145,7 +133,7 @@ def _cycle(reading: Reading) -> dict[str, Any]:
         "stalls": {
             "count": reading["stalls"],
             "latest_s": reading["stall"],
-            "latest_in": _name(Stage, reading["stall_in"]),
+            "latest_in": name_of(Stage, reading["stall_in"]),
         },
         "stages": {
             name: {"median_s": reading[f"{name}_p50"], "p99_s": reading[f"{name}_p99"], "max_s": reading[f"{name}_max"]}

@@ -18,6 +18,7 @@ from daemon.publish.command_messages import LONGEST_REQUEST
 from daemon.publish.command_socket import CLIENTS, CommandSocket
 from daemon.publish.commands import OnEnd
 from daemon.publish.modbus.holding import CommandCode, Outcome, Request
+from daemon.snapshot import State
 from hal.errors import DeviceRefused
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import closed, until
@@ -136,6 +137,22 @@ async def test_an_order_without_an_end_is_answered_in_time(tmp_path: Path, monke
     async with serving(tmp_path) as bench:
         said = await bench.answer({"command": "relocalise"})
         assert (said["result"], said["reason"]) == ("running", "not finished after 0.05 s")
+
+
+async def test_a_search_ends_when_the_place_is_confirmed(tmp_path: Path) -> None:
+    """The order has been taken long before, and a pose that is a guess is no result."""
+    async with serving(tmp_path) as bench:
+        reader, writer = await bench.ask({"command": "relocalise"})
+        await until(lambda: bool(bench.taken))
+        for state in (State.RELOCATING, State.AMBIGUOUS):
+            bench.server.publish(snapshot(state=state))
+            bench.taken[0][1](Outcome.DONE, "")
+        await asyncio.sleep(0.01)
+        assert len(bench.server.clients) == 1
+        bench.server.publish(snapshot(state=State.TRACKING))
+        said = json.loads(await closed(reader))
+        assert (said["result"], said["state"]) == ("done", "TRACKING")
+        writer.close()
 
 
 async def test_a_client_that_does_not_wait_harms_nothing(tmp_path: Path) -> None:

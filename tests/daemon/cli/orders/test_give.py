@@ -18,6 +18,7 @@ from daemon.config.paths import commands_beside
 from daemon.config.schema import Config, ModbusConfig
 from daemon.publish.feeds import Feeds
 from daemon.publish.network import Network
+from daemon.snapshot import State
 from daemon.system import console
 from daemon.system.callbacks import OnDone
 from estimator import Command, Order
@@ -34,6 +35,7 @@ class Robot:
         self.port = free_port()
         self.commands: list[Command] = []
         self.switched: list[int] = []
+        self.states: list[State] = []  # of the next snapshots; then TRACKING
         feeds = Feeds(
             on_odometry=lambda _: None,
             on_imu=lambda _: None,
@@ -47,11 +49,13 @@ class Robot:
 
     def _command(self, command: Command) -> None:
         self.commands.append(command)
-        asyncio.get_running_loop().call_later(0.01, self._publish)
+        for later in range(1, 1 + max(1, len(self.states))):
+            asyncio.get_running_loop().call_later(0.01 * later, self.publish)
 
-    def _publish(self) -> None:
+    def publish(self) -> None:
+        state = self.states.pop(0) if self.states else State.TRACKING
         for sink in self.network.sinks:
-            sink(snapshot(pose=(1.0, 2.0, math.pi / 2)))
+            sink(snapshot(state=state, pose=(1.0, 2.0, math.pi / 2)))
 
     def _switch(self, map_id: int, on_done: OnDone) -> None:
         self.switched.append(map_id)
@@ -119,7 +123,10 @@ async def test_a_refusal_is_said_and_fails(tmp_path: Path, monkeypatch: pytest.M
 async def test_orders_over_modbus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lumiloop: Said) -> None:
     async with driving(tmp_path, monkeypatch) as robot:
         host = f"127.0.0.1:{robot.port}"
-        assert await lumiloop("set-pose", "1", "2", "1.5rad", "--host", host) == (console.OK, "pose set\n", "")
+        code, out, err = await lumiloop("set-pose", "1", "2", "1.5rad", "--host", host)
+        assert (code, err) == (console.OK, "")
+        assert out.startswith("pose set; state ")
+        assert out.endswith(", x 1.000 m, y 2.000 m, yaw 90.00 deg\n")
         assert robot.commands[0].T_map_base == pytest.approx((1.0, 2.0, 1.5))
         assert (await lumiloop("switch-map", "0x1a2b3c4d", "--host", host))[0] == console.OK
         code, _, err = await lumiloop("dump", "--host", host)
@@ -132,11 +139,31 @@ async def test_orders_over_modbus(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert robot.commands == []
 
 
+async def test_a_search_over_modbus_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lumiloop: Said
+) -> None:
+    async with driving(tmp_path, monkeypatch) as robot:
+        words = ("relocalise", "--host", f"127.0.0.1:{robot.port}")
+        robot.states = [State.RELOCATING, State.RELOCATING]
+        asked = asyncio.create_task(lumiloop(*words))
+        await until(lambda: not robot.states)
+        await asyncio.sleep(0.3)
+        assert not asked.done()
+        robot.publish()
+        code, out, _ = await asked
+        assert code == console.OK
+        assert out.startswith("position found; state TRACKING, x 1.000 m")
+        robot.states = [State.LOST]
+        code, _, err = await lumiloop(*words, "--timeout", "0.5")
+        assert code == console.FAILED
+        assert "not finished in time" in err
+
+
 async def test_an_order_that_does_not_end_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lumiloop: Said
 ) -> None:
     async with driving(tmp_path, monkeypatch) as robot:
-        monkeypatch.setattr(robot, "_publish", lambda: None)
+        monkeypatch.setattr(robot, "publish", lambda: None)
         code, _, err = await lumiloop("relocalise", "--timeout", "0.2")
         assert code == console.FAILED
         assert "not finished after 0.2 s; the order stays in force" in err
