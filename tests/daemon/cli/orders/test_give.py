@@ -101,7 +101,7 @@ async def test_orders_of_this_computer(tmp_path: Path, monkeypatch: pytest.Monke
         assert out.endswith(", x 1.000 m, y 2.000 m, yaw 90.00 deg\n")
         assert robot.commands[0].order is Order.SET_POSE
         assert robot.commands[0].T_map_base == pytest.approx((1.0, -2.5, -math.pi / 2))
-        assert (await lumiloop("relocalise"))[1].startswith("position found; state ")
+        assert (await lumiloop("relocalise"))[1].startswith("search ended; state ")
         assert (await lumiloop("pause"))[1].startswith("paused: ")
         assert (await lumiloop("resume"))[1].startswith("pause ended; ")
         assert [command.order for command in robot.commands[1:]] == [Order.RELOCALISE, Order.PAUSE, Order.RESUME]
@@ -152,7 +152,7 @@ async def test_a_search_over_modbus_is_waited_for(
         robot.publish()
         code, out, _ = await asked
         assert code == console.OK
-        assert out.startswith("position found; state TRACKING, x 1.000 m")
+        assert out.startswith("search ended; state TRACKING, x 1.000 m")
         robot.states = [State.LOST]
         code, _, err = await lumiloop(*words, "--timeout", "0.5")
         assert code == console.FAILED
