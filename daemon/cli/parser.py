@@ -298,7 +298,7 @@ def _codes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", choices=("A", "B", "D"), default="A", help="air interface; default: A")
     parser.add_argument("--code", type=int, metavar="N", help="this one only; default: all")
     parser.add_argument("--format", choices=("c", "csv", "json"), default="csv", help="default: csv")
-    parser.set_defaults(body=loaded("daemon.cli.codes", "main"))
+    parser.set_defaults(body=loaded("daemon.cli.lamps.codes", "main"))
 
 
 def _version() -> str:

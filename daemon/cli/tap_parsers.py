@@ -57,7 +57,7 @@ def _lamps(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--history", type=Path, metavar="FILE", help="default: lamps.csv beside the folder of maps")
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     listening(parser)
-    parser.set_defaults(body=later("daemon.cli.lamps", "main"))
+    parser.set_defaults(body=later("daemon.cli.lamps.history", "main"))
 
 
 def _metrics(parser: argparse.ArgumentParser) -> None:
