@@ -50,6 +50,7 @@ class Computer(Host):
     ports: dict[int, int] = field(default_factory=dict)
     warmth: Warmth | None = field(default_factory=lambda: Warmth(False, 0.8))
     no_cache: str = ""
+    warmed_for: PhotodiodeConfig | None = None
     rights: bool = True
 
     def utc(self) -> float:
@@ -86,7 +87,7 @@ class Computer(Host):
         return "Name or service not known" if host == "nohost" else ""
 
     def warm(self, photodiode: PhotodiodeConfig) -> Warmth | None:
-        assert photodiode.fitted
+        self.warmed_for = photodiode
         if self.no_cache:
             raise CannotLoad(self.no_cache)
         return self.warmth
@@ -111,8 +112,10 @@ def asked(file: Path | None, host: Host, *words: str, as_json: bool = False) -> 
 
 
 def test_where_all_is_well_nothing_has_to_be_fixed(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert asked(file, Computer()) == console.OK
+    computer = Computer()
+    assert asked(file, computer) == console.OK
     said = capsys.readouterr().out
+    assert computer.warmed_for == PhotodiodeConfig(bus=BUS)
     assert said.endswith("nothing has to be fixed\n")
     assert "FIX" not in said
     assert re.search(r"good +lidar +/dev/ttyACM0: UTM-30LX", said)

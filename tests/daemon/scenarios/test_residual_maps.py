@@ -16,7 +16,7 @@ import daemon.recording.disk_writer
 from daemon.config.residual_file import write_residuals
 from daemon.config.schema import Config, LightsConfig, PhotodiodeConfig
 from daemon.config.survey_loader import SurveyError, residuals_beside, write_survey
-from daemon.devices.light_setup import RESIDUALS, Lights, from_header, load_lights, lost_residuals
+from daemon.devices.light_setup import RESIDUALS, Lights, from_header, load_lights, lost_residuals, read_residuals
 from daemon.maps.initial_state import new_state
 from daemon.recording import disk_writer
 from daemon.recording.recorder import Recorder
@@ -135,11 +135,16 @@ def test_a_map_of_no_use_is_named_and_done_without(
     assert "driving without it" in caplog.text
 
 
-def test_a_map_that_cannot_be_read_stops_the_start(tmp_path: Path) -> None:
+def test_a_map_that_cannot_be_read_is_named_and_done_without(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     settings = configured(tmp_path)
     residuals_beside(Path(settings.lights.survey)).mkdir()
+    lights = load_lights(settings)
+    assert lights is not None
+    assert lights.residuals == b""
+    assert "residuals.npz: cannot be read" in caplog.text
+    assert "driving without it" in caplog.text
     with pytest.raises(SurveyError, match=r"residuals\.npz: cannot be read"):
-        load_lights(settings)
+        read_residuals(Path(settings.lights.survey))
 
 
 def test_a_damaged_head_is_not_of_this_version() -> None:
