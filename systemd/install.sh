@@ -15,6 +15,7 @@ PYTHON=${PYTHON:-/usr/bin/python3}
 SOURCE=$(cd "$(dirname "$0")/.." && pwd)
 ROOT=${DESTDIR}${PREFIX}
 UNITS=/usr/lib/systemd/system
+SHELLS="bash zsh fish"
 TAP_UNITS="lumiloop-view.service lumiloop-foxglove.service lumiloop-metrics.service lumiloop-record.service lumiloop-ros2.service lumiloop-fleet.service lumiloop-fleet-router.service"
 UNIT_FILES="lumiloop.service lumiloop-warmup.service lumiloop-lamps.service lumiloop-lamps.timer $TAP_UNITS"
 MARK=.lumiloop
@@ -44,7 +45,7 @@ environment() {
     "$PYTHON" -m venv "$ROOT"
     "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r "$SOURCE/requirements/core.lock"
     wheel=$(mktemp -d)
-    tar -C "$SOURCE" -cf - pyproject.toml README.md LICENSE daemon hal estimator taps | tar -C "$wheel" -xf -
+    tar -C "$SOURCE" -cf - pyproject.toml README.md LICENSE daemon hal estimator taps tools/__init__.py tools/demo tools/sim | tar -C "$wheel" -xf -
     PIP_CONSTRAINT="$SOURCE/requirements/build.txt" "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --no-deps "$wheel"
     rm -rf "$wheel"
     "$ROOT/bin/python" -m pip uninstall --quiet --disable-pip-version-check --yes setuptools pip
@@ -60,6 +61,18 @@ environment() {
     "$PYTHON" -m compileall -q -j 0 -s "$DESTDIR" --invalidation-mode checked-hash "$ROOT/lib" || true
     mkdir -p "$DESTDIR/usr/bin"
     ln -sfn "$PREFIX/bin/lumiloop" "$DESTDIR/usr/bin/lumiloop"
+}
+
+manual() { # a command of this source that prints or writes help; it needs no installed package
+    PYTHONPATH=$SOURCE PYTHONDONTWRITEBYTECODE=1 "$PYTHON" -P -m daemon "$@"
+}
+
+completion() { # the place of a shell's completion script
+    case "$1" in
+        bash) echo usr/share/bash-completion/completions/lumiloop ;;
+        zsh) echo usr/share/zsh/vendor-completions/_lumiloop ;;
+        fish) echo usr/share/fish/vendor_completions.d/lumiloop.fish ;;
+    esac
 }
 
 files() {
@@ -88,6 +101,12 @@ files() {
     done
     for program in "$SOURCE"/tools/clients/[!_]* "$SOURCE"/tools/transmitter/[!_]*; do
         if [ -f "$program" ]; then put 644 "${program#"$SOURCE/"}" "/usr/share/doc/lumiloop/${program#"$SOURCE/"}"; fi
+    done
+    manual man --out "$DESTDIR/usr/share/man/man1" > /dev/null
+    for shell in $SHELLS; do
+        place=$DESTDIR/$(completion "$shell")
+        install -d "$(dirname "$place")"
+        manual completion "$shell" > "$place"
     done
     ln -sfn examples "$DESTDIR/usr/share/doc/lumiloop/systemd" # as the pages name them
     for code in "$ROOT"/lib/python3*/site-packages/estimator; do # relative: it holds below DESTDIR, too
@@ -131,6 +150,8 @@ case "${1:-}" in
         fi
         rm -rf "$ROOT" "$DESTDIR/usr/share/doc/lumiloop"
         for unit in $UNIT_FILES; do rm -f "$DESTDIR$UNITS/$unit"; done
+        for shell in $SHELLS; do rm -f "$DESTDIR/$(completion "$shell")"; done
+        rm -f "$DESTDIR"/usr/share/man/man1/lumiloop.1 "$DESTDIR"/usr/share/man/man1/lumiloop-*.1
         rm -f "$DESTDIR/usr/bin/lumiloop" \
             "$DESTDIR/usr/lib/udev/rules.d/60-lumiloop.rules" "$DESTDIR/usr/lib/systemd/catalog/lumiloop.catalog" \
             "$DESTDIR/usr/lib/sysusers.d/lumiloop.conf"

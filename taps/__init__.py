@@ -7,5 +7,5 @@ daemon a buffer. Libraries that only a tap needs are extras; a command names the
 * ``metrics``: Prometheus and VDA 5050 over HTTP. ``fleet``: several robots over Zenoh.
 * ``stream``: recordings as a stream, and the map assembled from tiles.
 
-Modules of the room itself are shared by the packages: ``access_guard``, ``command_client``, ``zenoh_session``.
+Modules of the room itself are shared by the packages: ``access_guard``, ``zenoh_session``.
 """

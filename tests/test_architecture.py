@@ -42,7 +42,7 @@ ORDER = {
         *("publish", "environment", "app", "replay", "diagnosis", "commissioning", "cli", "__main__"),
     ),
     "taps": (
-        *("stream", "access_guard", "command_client", "zenoh_session", "ros", "foxglove", "mcap", "view", "metrics"),
+        *("stream", "access_guard", "zenoh_session", "ros", "foxglove", "mcap", "view", "metrics"),
         "fleet",
     ),
     "tools": ("ci", "clients", "sim", "relations", "demo", "bench", "experiments", "soak", "docs"),

@@ -10,10 +10,14 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from daemon.system.console import OK, USAGE, fail, say
+from daemon.system.console import OK, USAGE, fail, note
 from daemon.system.extras import how_to_install
 from daemon.system.logging import start_command_log
+
+if TYPE_CHECKING:
+    from daemon.config.discovery import Source
 
 OURS = ("daemon", "estimator", "hal", "taps")
 
@@ -21,10 +25,11 @@ Body = Callable[[argparse.Namespace], int]
 """Runs a command and returns the exit code."""
 
 
-def config_arguments(parser: argparse.ArgumentParser, file: bool = True) -> None:
+def config_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the options of every command that reads the configuration; see :func:`configured`."""
-    if file:
-        parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file; default: built-in values")
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="configuration file; default: the first found (config show)"
+    )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrule one key")
     parser.add_argument("--print-config", action="store_true", help="print the resolved configuration and stop")
 
@@ -49,7 +54,7 @@ def estimating(module: str, name: str, opens: str, what: str = "warm") -> Body:
         except inputs.REFUSALS as error:
             return fail(str(error))
         try:
-            warmup.load_aloud(say, what, warmup.load, module)
+            warmup.load_aloud(note, what, warmup.load, module)
         except warmup.CannotLoad as error:
             return fail(str(error))
         return loaded(module, name)(args)
@@ -71,8 +76,22 @@ def loaded(module: str, name: str) -> Body:
     return body
 
 
+def find_config(args: argparse.Namespace) -> Source:
+    """Finds the configuration file of a command and keeps it as ``args.source``; says which, if nobody has named it."""
+    from daemon.config import discovery
+
+    source = args.source = discovery.find(args.config)
+    if source.file is not None and not source.named:
+        note(f"configuration {source}")
+    return source
+
+
 def configured(body: Body) -> Body:
-    """Returns a body that runs with the resolved configuration as ``args.settings``."""
+    """Returns a body that runs with the resolved configuration as ``args.settings``, and its file as ``args.source``.
+
+    ``args.config`` stays what the command line names: a recording is replayed under another configuration only if the
+    user asks for that.
+    """
 
     def resolve_and_run(args: argparse.Namespace) -> int:
         from daemon.config import loader
@@ -81,7 +100,7 @@ def configured(body: Body) -> Body:
         if getattr(args, "lidar", None):
             overrides.append(f"lidar.device={args.lidar}")
         try:
-            args.settings = loader.load(args.config, overrides)
+            args.settings = loader.load(find_config(args).file, overrides)
         except loader.ConfigError as error:
             return fail(str(error), USAGE)
         if args.print_config:

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 
+from daemon.cli.command_body import find_config
 from daemon.config import loader
 from daemon.config.paths import stream_path
 from daemon.diagnosis.checks import CHECKS, Case, Finding, Level
@@ -23,12 +24,12 @@ def main(args: argparse.Namespace) -> int:
 def examine(args: argparse.Namespace, host: Host) -> int:
     """Runs the command on a given computer."""
     try:
-        settings = loader.load(args.config, list(args.set))
+        settings = loader.load(find_config(args).file, list(args.set))
     except loader.ConfigError as error:
         wrong = Finding("configuration", Level.FIX, str(error), "mend it; nothing else can be judged before")
         _tell([wrong], args.json)
         return console.USAGE
-    case = Case(settings, args.config, host, host.listen(args.stream or stream_path(settings.name)))
+    case = Case(settings, args.source.file, host, host.listen(args.stream or stream_path(settings.name)))
     found = [finding for check in CHECKS for finding in check(case)]
     _tell(found, args.json)
     return console.FAILED if any(finding.level is Level.FIX for finding in found) else console.OK

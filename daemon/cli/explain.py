@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final
 
+from daemon.cli.reports.output import print_report
 from daemon.config import loader
 from daemon.config.schema import Config
 from daemon.health.faults import FAULTS
@@ -61,6 +62,17 @@ class Entry:
     text: str
     remedy: str = ""
 
+    def as_object(self) -> dict[str, Any]:
+        """Returns the entry for a program; ``numbers``: first and last one."""
+        numbers = [self.numbers[0], self.numbers[-1]] if self.numbers else None
+        return {
+            "kind": self.kind,
+            "name": self.name,
+            "numbers": numbers,
+            "text": self.text,
+            "remedy": self.remedy or None,
+        }
+
     def __str__(self) -> str:
         number = f" {self.numbers[0]}" if self.numbers else ""
         remedy = f"\n  what to do: {self.remedy}" if self.remedy else ""
@@ -72,6 +84,12 @@ def main(args: argparse.Namespace) -> int:
     asked = " ".join(args.words).strip().strip("`")
     everything = list(entries())
     found = find(asked, everything)
+    if args.json:
+        hint = "" if found else _hint(asked, everything)
+        print_report(
+            "explain", {"asked": asked, "entries": [entry.as_object() for entry in found], "hint": hint or None}
+        )
+        return OK if found else FAILED
     if not found:
         return fail(f"{asked}: nothing of that name or number; {_hint(asked, everything)}", FAILED)
     sys.stdout.write("\n\n".join(str(entry) for entry in found[:_MOST]) + "\n")

@@ -13,9 +13,15 @@ from typing import Final
 
 from daemon.cli import tap_parsers
 from daemon.cli.command_body import Body, config_arguments, estimating, later, loaded
+from daemon.cli.config import parsers as config_parsers
+from daemon.cli.manual import verbs as manual
+from daemon.cli.manual.command_parser import CommandParser, finish, overview
+from daemon.cli.orders import parsers as order_parsers
+from daemon.system import console
 from daemon.system.console import INTERRUPTED, OK, USAGE, fail
 from estimator.paper import LUMILOOP, METHODS
 
+Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse has no public name for it
 LONGEST_RING: Final = 1440.0
 """Longest ring, minutes; a longer recording is kept whole."""
 PICTURES: Final = (".png", ".svg", ".pdf")
@@ -27,6 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         words = parser()
         args = words.parse_args(argv)
+        if (level := getattr(args, "log_level", None)) is not None:
+            _set_level(level)
         body: Body | None = getattr(args, "body", None)
         if body is None:
             words.print_help(sys.stderr)
@@ -39,20 +47,38 @@ def main(argv: Sequence[str] | None = None) -> int:
         return OK
 
 
+def _set_level(level: str) -> None:
+    from daemon.system.logging import set_level
+
+    set_level(level)
+    if level == "error":
+        console.be_quiet()
+
+
+class _Program(CommandParser):
+    """Parser of the program, whose help is an overview."""
+
+    def format_help(self) -> str:
+        return overview(self.description or "")
+
+
 def parser() -> argparse.ArgumentParser:
     """Returns the parser of every command; ``body`` of its result is the :data:`Body` to run."""
-    parser = argparse.ArgumentParser(
+    parser = _Program(
         prog="lumiloop",
-        description="Indoor robot localisation from a 2D lidar and coded ceiling lights: a pose over Modbus and UDP. "
-        "Not a safety function.",
+        description="Indoor robot localisation from a 2D lidar and coded ceiling lights.\n"
+        "It publishes a pose over Modbus and UDP. It is not a safety function.",
     )
     _print_option(parser, "--version", _version, "the version")
     _print_option(parser, "--schema", _schema, "the JSON schema of the configuration")
     _print_option(parser, "--reference", _reference, "the configuration's reference (Markdown)")
     _print_option(parser, "--print-config", _defaults, "every key of the configuration with its default")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    commands: Commands[argparse.ArgumentParser] = parser.add_subparsers(
+        title="commands", metavar="COMMAND", dest="command", parser_class=CommandParser
+    )
     _run(commands.add_parser("run", help="read the sensors, publish the pose, until stopped"))
     _check(commands.add_parser("check", help="say whether a configuration file, and the survey it names, are good"))
+    config_parsers.add(commands)
     _probe(commands.add_parser("probe", help="find lidars and photodiode converters and say what they are"))
     _replay(commands.add_parser("replay", help="run a log through the same pipeline as fast as possible"))
     _convert(commands.add_parser("convert", help="turn recorded lidar data of other formats into a log for replay"))
@@ -64,7 +90,10 @@ def parser() -> argparse.ArgumentParser:
     _survey(commands.add_parser("survey", help="where the lamps hang, from a recorded drive"))
     _warm(commands.add_parser("warm", help="compile the kernels of this version now, and not at the first start"))
     _codes(commands.add_parser("codes", help="print the code tables for those who build lamps"))
+    order_parsers.add(commands)
     tap_parsers.add(commands)
+    manual.add(commands, parser, _version)
+    finish(parser)
     return parser
 
 
@@ -113,8 +142,11 @@ def _recording(body: Body) -> Body:
 
 
 def _check(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("config", type=Path, metavar="FILE", help="configuration file (TOML)")
-    config_arguments(parser, file=False)
+    parser.add_argument(
+        "file", nargs="?", type=Path, metavar="FILE", help="configuration file (TOML); the same as --config FILE"
+    )
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    config_arguments(parser)
     parser.set_defaults(body=loaded("daemon.cli.check", "main"))  # it resolves the configuration itself
 
 
@@ -133,6 +165,7 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--journal-at", type=float, metavar="SECONDS", help="and the first so long after the beginning")
     known = "; ".join(f"{name}: {what}" for name, what in METHODS.items())
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument("--method", choices=METHODS, default=LUMILOOP, help=f"{known}; default: {LUMILOOP}")
     config_arguments(parser)
     parser.set_defaults(body=estimating("daemon.cli.replay", "main", "log"))
@@ -157,6 +190,7 @@ def _why(parser: argparse.ArgumentParser) -> None:
         help="a recording or a dump, or a folder of several; default: `flight` in the state directory",
     )
     parser.add_argument("--out", type=_picture, metavar="FILE", help="and draw it: .png, .svg or .pdf")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
     config_arguments(parser)
     parser.set_defaults(body=estimating("daemon.cli.why", "main", "moment"))
 
@@ -171,6 +205,7 @@ def _status(parser: argparse.ArgumentParser) -> None:
 
 def _explain(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("words", nargs="+", metavar="WORD", help="as in: alert_m; DEGRADED; fault 302; map_yaw; 1008")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.set_defaults(body=loaded("daemon.cli.explain", "main"))
 
 
@@ -263,7 +298,7 @@ def _codes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", choices=("A", "B", "D"), default="A", help="air interface; default: A")
     parser.add_argument("--code", type=int, metavar="N", help="this one only; default: all")
     parser.add_argument("--format", choices=("c", "csv", "json"), default="csv", help="default: csv")
-    parser.set_defaults(body=loaded("daemon.cli.codes", "main"))
+    parser.set_defaults(body=loaded("daemon.cli.lamps.codes", "main"))
 
 
 def _version() -> str:

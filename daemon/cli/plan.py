@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Final
 
 import numpy as np
 
+from daemon.cli.reports.output import print_report
+from daemon.cli.reports.plan import as_object
 from daemon.commissioning import plan_plot
 from daemon.commissioning.floor import Array, Hall, NoHall, read_hall
 from daemon.commissioning.lamp_selection import Goals, Plan, choose, codes_for, plan_of
@@ -45,8 +48,13 @@ def main(args: argparse.Namespace) -> int:
         plan = choose(hall, fitting, walls, goals) if survey is None else plan_of(
             hall, fitting, walls, goals, _in_plan(hall, np.array([(lamp.x, lamp.y) for lamp in survey.lamps]))
         )  # fmt: skip
-        sys.stdout.write(report(hall, plan, goals, fitting))
-        _write(args, hall, plan, receiver, survey is None)
+        if args.json:
+            with contextlib.redirect_stdout(sys.stderr):
+                _write(args, hall, plan, receiver, survey is None)
+            print_report("plan", as_object(hall, plan, goals, fitting, args.out))
+        else:
+            sys.stdout.write(report(hall, plan, goals, fitting))
+            _write(args, hall, plan, receiver, survey is None)
         if survey is None and (short := plan.short_of(goals)):
             return console.fail(
                 f"{short}: plan parts of the hall apart, or lower the goals (--share, --links, --accuracy)"

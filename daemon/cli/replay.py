@@ -26,15 +26,21 @@ if TYPE_CHECKING:  # loaded only if matches are requested
 
 def main(args: argparse.Namespace) -> int:
     """Runs the command; returns the exit code."""
-    if args.journal is None and args.journal_at is None:
-        return command(args, write_all, method=args.method)
-    from daemon.replay import match_journal
+    journal = None
+    if args.journal is not None or args.journal_at is not None:
+        from daemon.replay import match_journal
 
-    try:
-        wanted = match_journal.choice_of(args.journal, args.journal_at)
-    except match_journal.BadChoice as error:
-        return console.fail(str(error), console.USAGE)
-    return command(args, write_all, match_journal.MatchJournal(wanted), args.method)
+        try:
+            journal = match_journal.MatchJournal(match_journal.choice_of(args.journal, args.journal_at))
+        except match_journal.BadChoice as error:
+            return console.fail(str(error), console.USAGE)
+    return command(args, _write_and_print if args.json else write_all, journal, args.method)
+
+
+def _write_and_print(folder: Folder, outcome: Outcome) -> None:
+    """Writes every result, and prints the summary on stdout."""
+    write_all(folder, outcome)
+    sys.stdout.write((folder.path / "summary.json").read_text())
 
 
 def command(

@@ -56,7 +56,9 @@ def main(args: argparse.Namespace) -> int:
     """
     start_log()
     settings: Config = args.settings
-    log.info("%s: configuration\n%s", settings.name, loader.dump(settings).rstrip())
+    overruled = f", with {len(args.set)} values of the command line" if args.set else ""
+    log.info("%s: configuration %s%s", settings.name, args.source, overruled)
+    log.debug("every value:\n%s", loader.dump(settings).rstrip())
     for other in streams_served(settings.name):  # this may be intended, but each device has one owner
         log.warning("a daemon named %s runs on this computer already (%s): %s", settings.name, other, SECOND)
     recorder = None

@@ -6,13 +6,14 @@ Standard library only, so that it starts at once on any computer.
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import sys
 import time
 from typing import TYPE_CHECKING, Final
 
-from daemon.cli.status_table import as_object, as_table
+from daemon.cli.reports.output import print_report
+from daemon.cli.reports.status import as_object
+from daemon.cli.status_table import as_table
 from daemon.publish.modbus.client import NoAnswer, Reader, Reading
 from daemon.publish.modbus.points import Value
 from daemon.publish.port_owner import Whose
@@ -91,9 +92,9 @@ def _watch(reader: Reader, as_json: bool) -> int:
 
 def _show(reading: Reading, as_json: bool, stalled: bool, who: Whose, on_screen: bool = False) -> None:
     if as_json:
-        text = json.dumps(as_object(reading, stalled) | {"process": who.pid or None})
-    else:
-        text = (f"{'daemon':<10} {who}\n" if who.pid else "") + as_table(reading, stalled)
+        print_report("status", as_object(reading, stalled, who.pid))
+        return
+    text = (f"{'daemon':<10} {who}\n" if who.pid else "") + as_table(reading, stalled)
     sys.stdout.write((_CLEAR + _fitted(text) if on_screen else text) + "\n")
     sys.stdout.flush()
 

@@ -1,4 +1,4 @@
-"""Status as a table for the operator, and as an object for a program, from the published registers."""
+"""Status as a table for the operator, from the published registers."""
 
 from __future__ import annotations
 
@@ -15,24 +15,6 @@ from daemon.snapshot import GUESSED, LISTED_LINKS, LightFix, LinkUse, Stage, Sta
 
 _TOP: Final = U16.span[1] / 10_000  # where ages and sigmas, 16 bits of 0.1 ms or 0.1 mm, saturate
 _GUESS: Final = "  (a guess: the place is not known)"
-
-
-def as_object(reading: Reading, stalled: bool) -> dict[str, Any]:
-    """Returns the reading with its codes and bits spelled out."""
-    spelled = {
-        "state": _state(reading["state"]),
-        "reason_text": _meaning("reason", reading["reason"]),
-        "fault_text": _meaning("fault", reading["fault"]),
-        "fault_causes": {str(fault): cause for fault, cause in _causes(reading).items() if cause},
-        "flags": registers.decode_bits(registers.FLAGS, reading["flags"]),
-        "devices": registers.decode_bits(registers.DEVICES, reading["devices"]),
-        "stalled": stalled,
-    }
-    if "witnesses" in reading:
-        spelled |= {"witnesses": registers.decode_bits(integrity_block.WITNESSES, reading["witnesses"])}
-    if "light_fix" in reading:
-        spelled |= {"light_fix": _fix(reading), "light_links": [dict(link) for link in _links(reading)]}
-    return {key: value for key, value in reading.items() if not key.startswith("link_")} | spelled
 
 
 def _fix(reading: Reading) -> str | None:

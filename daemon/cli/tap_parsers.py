@@ -29,13 +29,35 @@ def add(commands: Commands[argparse.ArgumentParser]) -> None:
     _ros2(commands.add_parser("ros2", help="a running daemon as a node of ROS 2, which need not be installed (Zenoh)"))
     _fleet(commands.add_parser("fleet", help="all robots on one map; join, share a survey and a map, fetch them"))
     _lamps(commands.add_parser("lamps", help="which lamps are dead, dimming or moved, and when to replace them"))
+    _demo(commands.add_parser("demo", help="the daemon on a simulated robot under coded lamps, without hardware"))
+
+
+def _demo(parser: argparse.ArgumentParser) -> None:
+    demo_arguments(parser)
+    parser.set_defaults(body=loaded("tools.demo.run", "run"))
+
+
+def demo_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of the demo."""
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--seconds", type=float, default=75.0, help="how long to watch (default %(default)s)")
+    length.add_argument(
+        "--forever", action="store_const", const=0.0, dest="seconds", help="until Ctrl-C; records 0.3 GB an hour"
+    )
+    parser.add_argument("--dark", action="store_true", help="without lamps: lidar and odometry alone")
+    parser.add_argument("--kidnap", action="store_true", help="carry the robot away instead of switching sensors off")
+    parser.add_argument("--building", default="paper_room", help="building to drive in; default: %(default)s")
+    parser.add_argument("--seed", type=int, default=0, help="of noise, slip and people")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="for the results; default: %(default)s"
+    )
 
 
 def _lamps(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--history", type=Path, metavar="FILE", help="default: lamps.csv beside the folder of maps")
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     listening(parser)
-    parser.set_defaults(body=later("daemon.cli.lamps", "main"))
+    parser.set_defaults(body=later("daemon.cli.lamps.history", "main"))
 
 
 def _metrics(parser: argparse.ArgumentParser) -> None:
@@ -167,6 +189,7 @@ def _plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("plan"), metavar="DIR", help="for lights.toml and plan.png; plan"
     )
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
     config_arguments(parser)
     parser.set_defaults(body=later("daemon.cli.plan", "main"))
 

@@ -11,6 +11,8 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+from daemon.cli.reports.output import print_report
+from daemon.cli.reports.why import as_object
 from daemon.diagnosis import moment_plot, moment_report
 from daemon.diagnosis.moment import Moment, chosen
 from daemon.diagnosis.moment_replay import moments
@@ -31,7 +33,10 @@ def main(args: argparse.Namespace) -> int:
             _try(args.out)
         told, rerun = moments(span, utc)
         second = whole_second(args.time)
-        sys.stdout.write(moment_report.report(told, utc, span.path.name, wide, second, span.remarks))
+        if args.json:
+            print_report("why", as_object(told, utc, span.path.name, wide, second) | {"remarks": span.remarks or None})
+        else:
+            sys.stdout.write(moment_report.report(told, utc, span.path.name, wide, second, span.remarks))
         if rerun.comparison.differ:
             console.say(
                 f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
+from daemon.config.edit import CannotEdit, with_values
 from daemon.config.endpoints import AUTO
 from daemon.config.errors import MOVED, Option, Wrong, line_of, options, problems, value_text
 from daemon.config.schema import Config
@@ -29,11 +30,14 @@ __all__ = [
     "dump",
     "load",
     "options",
+    "parsed",
     "reference",
     "refuse_overwriting",
     "schema",
+    "template",
     "value_text",
     "write",
+    "write_back",
 ]
 
 REFERENCE_HEAD: Final = """\
@@ -43,9 +47,19 @@ Generated from the configuration tree by `lumiloop --reference`; a test keeps it
 
 One TOML file holds everything, and every key has a default: an empty file is a valid configuration. Unknown keys and
 wrong values are refused, all at once, each with the file, the line, the key, what was found, what is allowed and an
-example. `lumiloop check FILE` says whether a file is good, `lumiloop check FILE --print-config` prints every value that
-results, and `lumiloop --schema` prints a JSON schema for editors. `--set KEY=VALUE` on the command line overrules the
-file.
+example. `lumiloop check` examines the file, and `lumiloop --schema` prints a JSON schema for editors. `--set KEY=VALUE`
+on the command line overrules the file.
+
+Every command uses the first of these files, and names it in its first line of output:
+
+1. the one that `--config FILE` names
+2. the one that the environment variable `LUMILOOP_CONFIG` names
+3. `lumiloop.toml` in the working directory
+4. `lumiloop/lumiloop.toml` in `$XDG_CONFIG_HOME` (by default `~/.config`)
+5. `/etc/lumiloop/lumiloop.toml`
+
+`lumiloop config init` writes a file with every key as a comment. `lumiloop config show` prints the file in use and
+every value that results. `lumiloop config set KEY=VALUE` changes a value in the file; comments stay.
 
 All keys with their defaults, ready to paste:
 
@@ -54,6 +68,11 @@ All keys with their defaults, ready to paste:
 
 MOST_BYTES: Final = 1 << 20
 """Largest size of a configuration file in bytes."""
+TEMPLATE_HEAD: Final = """\
+# Configuration of lumiloop. Every key has a default: remove the `#` before a line and change its value.
+# `lumiloop check` examines this file, `lumiloop config show` prints the values that result.
+
+"""
 
 
 class ConfigError(Exception):
@@ -161,7 +180,9 @@ def dump(config: Config) -> str:
 
 
 def write(path: Path, config: Config, notes: Sequence[str] = (), force: bool = False) -> None:
-    """Write the whole resolved tree to a file, atomically; `load` reads it back as an equal tree.
+    """Write a configuration to a file, atomically; `load` reads it back as an equal tree.
+
+    A new file gets the whole tree. In an existing one, only the values that differ change; its comments stay.
 
     Args:
         path: of the file.
@@ -174,10 +195,55 @@ def write(path: Path, config: Config, notes: Sequence[str] = (), force: bool = F
     """
     refuse_overwriting(path, force)
     head = "".join(f"# {note}".rstrip() + "\n" for note in notes)
+    text = _changed_to(path, config) if path.exists() else None
     try:
-        write_whole(path, f"{head}\n{dump(config)}".lstrip("\n").encode())
+        write_whole(path, f"{head}\n{dump(config) if text is None else text}".lstrip("\n").encode())
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}; free space or name another file") from error
+
+
+def _changed_to(path: Path, config: Config) -> str | None:
+    """The text of a file with the values that make it this configuration; None where that is not possible."""
+    try:
+        text, before = _read(path), load(path)
+        old, new = (_values(msgspec.to_builtins(one)) for one in (before, config))
+        changed = with_values(text, {key: value for key, value in new.items() if value != old[key]})
+        return changed if _anchored(msgspec.convert(tomllib.loads(changed), Config), path) == config else None
+    except (ConfigError, CannotEdit, msgspec.ValidationError):
+        return None
+
+
+def _values(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of a tree by path."""
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        found |= _values(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
+
+
+def write_back(path: Path, values: Mapping[str, object]) -> None:
+    """Set single keys of a configuration file; its comments stay. The result is checked before it is written.
+
+    Raises:
+        ConfigError: the file cannot be read, changed or written, or a value is wrong.
+    """
+    text = _read(path) if path.exists() else ""
+    try:
+        changed = with_values(text, values)
+    except (CannotEdit, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path}: {error}") from None
+    found = problems(tomllib.loads(changed), str(path), changed)
+    if found:
+        raise ConfigError("\n".join(wrong.text for wrong in found))
+    try:
+        write_whole(path, changed.encode())
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}; free space or name another file") from error
+
+
+def template() -> str:
+    """A configuration file in which every key stands as a comment, with its meaning and its default."""
+    return TEMPLATE_HEAD + "\n".join(_commented("# ")) + "\n"
 
 
 def refuse_overwriting(path: Path, force: bool) -> None:
@@ -193,6 +259,12 @@ def schema() -> str:
 
 def reference() -> str:
     """The reference page of the configuration: every key with its meaning, its range and its default."""
+    lines = _commented("")
+    return REFERENCE_HEAD + "```toml\n" + "\n".join(lines) + "\n```\n"
+
+
+def _commented(before: str) -> list[str]:
+    """Every key with its meaning and its default; ``before``: what stands before the assignments."""
     lines: list[str] = []
     table = ""
     for option in options():
@@ -200,30 +272,43 @@ def reference() -> str:
         if parent != table:
             table = parent
             lines += ["", f"[{parent}]"]
-        lines += [f"# {option.description} ({option.kind})", f"{key} = {value_text(option.default)}"]
-    return REFERENCE_HEAD + "```toml\n" + "\n".join(lines) + "\n```\n"
+        lines += [f"# {option.description} ({option.kind})", f"{before}{key} = {value_text(option.default)}"]
+    return lines
 
 
 def _read(file: Path) -> str:
     try:
         return read_named(file, MOST_BYTES).decode()
     except FileNotFoundError:
-        raise ConfigError(f"{file}: no such file (name an existing one, or leave --config out for defaults)") from None
+        raise ConfigError(f"{file}: no such file (name an existing one with --config)") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"{file}: not UTF-8 text at byte {error.start}") from None
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
 
 
-def _lay_over(tree: dict[str, Any], override: str) -> None:
+def parsed(override: str) -> tuple[str, object]:
+    """Key and value of a text ``KEY=VALUE``; an unquoted word is a string, so that a shell needs no second quotes.
+
+    Raises:
+        ConfigError: it has another form.
+    """
     path, equals, text = override.partition("=")
     if not equals or not path.strip():
-        raise ConfigError(f"--set {override}: expected KEY=VALUE, for example --set modbus.port=1502")
+        raise ConfigError(f"{override}: expected KEY=VALUE, for example modbus.port=1502")
     try:
         value: object = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
-        value = text  # an unquoted word is a string, so that a shell needs no second pair of quotes
-    *parents, key = path.strip().split(".")
+        value = text
+    return path.strip(), value
+
+
+def _lay_over(tree: dict[str, Any], override: str) -> None:
+    try:
+        path, value = parsed(override)
+    except ConfigError as error:
+        raise ConfigError(f"--set {error}") from None
+    *parents, key = path.split(".")
     for parent in parents:
         child = tree.setdefault(parent, {})
         if not isinstance(child, dict):

@@ -46,6 +46,11 @@ def stream_path(name: str) -> Path:
     return service if _there(service) and not _there(own) else own
 
 
+def commands_beside(stream: Path) -> Path:
+    """Socket at which the daemon with that local stream takes commands."""
+    return stream.with_name(f"{stream.name.removesuffix('.stream')}.commands")
+
+
 def streams_served(name: str) -> list[Path]:
     """Local streams that daemons of that ``name`` serve on this computer now: this user's, then the service's."""
     paths = [folder / f"{name}.stream" for folder in dict.fromkeys((runtime_folder(), SERVICE))]

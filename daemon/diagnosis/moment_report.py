@@ -260,11 +260,17 @@ def _listed(changes: list[tuple[bool, str]]) -> Iterator[str]:
 
 def _changes(told: Sequence[Moment]) -> Iterator[tuple[bool, str]]:
     """Yields one line per change, oldest first, and whether it was published as state or fault."""
+    for utc, grave, text in changes(told):
+        yield grave, f"{of_day(utc)}  {text}"
+
+
+def changes(told: Sequence[Moment]) -> Iterator[tuple[float, bool, str]]:
+    """Yields the time (UTC, s) of each change, whether it was published as state or fault, and its description."""
     for before, one in pairwise(told):
         for text in _published(before, one):
-            yield True, f"{of_day(one.utc)}  {text}"
+            yield one.utc, True, text
         for text in _changed(before, one):
-            yield False, f"{of_day(one.utc)}  {text}"
+            yield one.utc, False, text
 
 
 def _published(before: Moment, one: Moment) -> Iterator[str]:

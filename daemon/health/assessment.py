@@ -275,7 +275,9 @@ STORE: Final = {
     "thread": Fault.THREAD_HANGS,
 }
 """Faults by name of a component or thread that stores data and is down."""
-PUBLISHERS: Final = frozenset(["modbus", "modbus serial", "pose", "pose subscriptions", "stream", "publisher"])
+PUBLISHERS: Final = frozenset(
+    ["modbus", "modbus serial", "pose", "pose subscriptions", "stream", "commands", "publisher"]
+)
 """Names of components that publish, including those that the cycle calls."""
 
 

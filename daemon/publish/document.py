@@ -9,7 +9,7 @@ from typing import Any
 
 from daemon.health.faults import FAULTS
 from daemon.health.reasons import REASONS
-from daemon.publish.document_tables import NOT_KNOWN, NOTICE, bit_rows, holding_rows, layout_rows, table
+from daemon.publish.document_tables import NOT_KNOWN, NOTICE, bit_rows, holding_rows, layout_rows, order_lines, table
 from daemon.publish.document_udp import udp_page
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.modbus import (
@@ -254,6 +254,13 @@ is `tools/clients/send_command.py`.
 {table(("`command`", "name", "what happens"), _command_rows())}
 
 {table(head, holding_rows(holding.COMMAND, holding.COMMAND_ADDRESS))}
+
+`lumiloop set-pose`, `relocalise`, `save-map`, `switch-map`, `pause`, `resume` and `dump` give these orders, wait for
+the result and print it: on the robot itself without `modbus.write` (see [the local stream](stream.md#orders)), from
+elsewhere with `--host HOST[:PORT]`. With `mbpoll` each is one line, with `-0`: addresses from 0, as on this page. The
+first of the two last numbers is the request's: a new one each time.
+
+{order_lines()}
 
 ### Loop acknowledge, {holding.LOOP_ADDRESS}
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from daemon.publish.modbus import registers
+from daemon.publish.modbus.holding import COMMAND, COMMAND_ADDRESS, CommandCode
 from daemon.publish.modbus.points import Layout, Point, Rule
 
 NOTICE: Final = (
@@ -56,3 +57,26 @@ def holding_rows(layout: Layout, start: int) -> list[tuple[str, ...]]:
 def bit_rows(bits: tuple[registers.Bit, ...]) -> list[tuple[str, ...]]:
     """Rows of named bits."""
     return [(str(number), f"`{name}`", text) for number, (name, text, _) in enumerate(bits)]
+
+
+MBPOLL: Final = "mbpoll -m tcp -p 1502 -t 4{kind} -0 -r {address}"
+"""Write or read of holding registers, with addresses from 0."""
+
+
+def order_lines() -> str:
+    """A line of ``mbpoll`` for every command, as a block of Markdown."""
+    at = dict(zip((point.name for point in COMMAND.points), COMMAND.offsets, strict=True))
+    pose, map_id, answer = (COMMAND_ADDRESS + at[name] for name in ("x", "map_id", "acknowledge"))
+    before = {
+        CommandCode.SET_POSE: MBPOLL.format(kind=":int -B", address=pose)
+        + " HOST -- 15000 -20000 1570796     # x 1.5 m, y -2 m, yaw 1.570796 rad",
+        CommandCode.SWITCH_MAP: MBPOLL.format(kind=":hex", address=map_id) + " HOST 0x1a2b 0x3c4d     # map 1a2b3c4d",
+    }
+    lines = []
+    for number, code in enumerate(CommandCode, 1):
+        lines += [before[code]] if code in before else []
+        order = MBPOLL.format(kind="", address=COMMAND_ADDRESS)
+        lines.append(f"{order} HOST {number} {code.value}     # {code.name}")
+    result = MBPOLL.format(kind="", address=answer)
+    lines.append(f"{result} -c 2 -1 HOST     # request's number, result")
+    return "\n".join(f"    {line}" for line in lines)

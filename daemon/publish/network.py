@@ -9,20 +9,24 @@ import asyncio
 import logging
 import math
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from daemon.config.endpoints import ANYBODY, interface_of, parse_endpoint, subscription_port
+from daemon.config.paths import commands_beside
 from daemon.config.schema import Config, ModbusConfig
 from daemon.health.reasons import REASONS, Reason
 from daemon.integrity.arrival_monitor import ODOMETRY_SILENT_S
 from daemon.publish.allow_list import Access
+from daemon.publish.commands import Orders
 from daemon.publish.feeds import Feeds, OnOdometry
 from daemon.runtime.cycle_parts import Sink
 from hal.clock import Clock
 from hal.odometry import RawOdometry
 
 if TYPE_CHECKING:
+    from daemon.publish.modbus.holding import Outcome
     from daemon.publish.modbus.server import ModbusPublisher
     from daemon.publish.stream.server import StreamServer
     from daemon.publish.udp_sender import PoseSender
@@ -72,6 +76,7 @@ class Network:
         self._feeds = feeds
         self._access = Access(settings.allow, settings.bind)
         self._odometry = OneSender(feeds.on_odometry)
+        self._orders = Orders(clock, feeds)
         self.modbus: ModbusPublisher | None = None
         self.pose: PoseSender | None = None
         if settings.modbus.port or settings.modbus.line is not None:
@@ -83,6 +88,8 @@ class Network:
         self.stream: StreamServer | None = None
         if stream is not None:
             self._add_stream(stream)
+            self._add_commands(commands_beside(stream))
+        self.sinks.append(self._orders.published)  # last: a client that is told of the end finds the snapshot published
 
     @property
     def failing(self) -> set[str]:
@@ -90,21 +97,20 @@ class Network:
         return {"pose"} if self.pose is not None and self.pose.failing else set()
 
     def _add_modbus(self, settings: ModbusConfig) -> None:
-        from daemon.publish.commands import Orders
         from daemon.publish.modbus.server import ModbusPublisher
 
+        orders = self._orders
         modbus = ModbusPublisher(
             self._clock,
             name=self._settings.name,
             write=settings.write,
             allowed=self._access,
-            on_command=lambda request: orders.handle(request),
+            on_command=lambda request: orders.handle(request, partial(_acknowledge, modbus, request.number)),
             on_odometry=self._from("Modbus"),
             on_loop_seen=self._feeds.on_loop_seen,
         )
-        orders = Orders(self._clock, self._feeds, modbus.acknowledge)
         self.modbus = modbus
-        self.sinks += [modbus.publish, orders.published]
+        self.sinks.append(modbus.publish)
         if settings.port:
             self.parts["modbus"] = lambda: _open(lambda: modbus.start(self._settings.bind, settings.port), modbus.close)
         if settings.line is not None:
@@ -133,6 +139,13 @@ class Network:
         self.sinks.append(server.publish)
         self.parts["stream"] = server.run
 
+    def _add_commands(self, path: Path) -> None:
+        from daemon.publish.command_socket import CommandSocket
+
+        server = CommandSocket(path, self._orders.handle)
+        self.sinks.append(server.publish)
+        self.parts["commands"] = server.run
+
     def _add_inputs(self) -> None:
         from hal.net.inputs import InputPort
 
@@ -144,6 +157,11 @@ class Network:
     def _from(self, sender: str) -> OnOdometry:
         """Callback for the readings of one sender."""
         return lambda reading: self._odometry.receive(sender, reading)
+
+
+def _acknowledge(modbus: ModbusPublisher, number: int, outcome: Outcome, reason: str) -> None:
+    """Report the end of a Modbus client's command; the reason is in the log."""
+    modbus.acknowledge(number, outcome)
 
 
 async def _open(start: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]) -> None:

@@ -22,6 +22,7 @@ from estimator.paper import LUMILOOP
 
 LONGEST_NAME: Final = 64
 """Longest name of a map, characters."""
+SCHEMA: Final = "lumiloop.replay/1"
 LOOPS_HEAD: Final = "stamp,counter,keyframe_new,keyframe_old,residual_m\n"
 
 
@@ -74,6 +75,7 @@ def summary(outcome: Outcome, grid: Grid) -> dict[str, Any]:
     driven_m, turned_rad = ledger.way()
     rows, columns = grid.log_odds.shape
     return {
+        "schema": SCHEMA,
         "log": {
             "name": source.path.name,
             "kind": source.kind,

@@ -20,8 +20,25 @@ def fail(message: str, code: int = FAILED) -> int:
     return code
 
 
+class _Output:
+    quiet = False
+
+
+def be_quiet() -> None:
+    """Print no notes and no progress from now on; errors and results stay."""
+    _Output.quiet = True
+
+
+def note(text: str) -> None:
+    """Print a line on stderr that is no result, unless the user wants none."""
+    if not _Output.quiet:
+        say(text)
+
+
 def progress(text: str) -> None:
     """Print a progress line on stderr: overwritten on a terminal, appended elsewhere."""
+    if _Output.quiet:
+        return
     sys.stderr.write(f"\r\x1b[K{text}" if sys.stderr.isatty() else f"{text}\n")
     sys.stderr.flush()
 

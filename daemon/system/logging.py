@@ -8,6 +8,7 @@ import os
 import socket
 import sys
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +16,8 @@ from daemon.system.traceback_limit import limit_tracebacks
 
 JOURNAL: Final = Path("/run/systemd/journal/socket")
 TERMINAL_FORMAT: Final = "%(asctime)s %(levelname)-7s %(message)s"
+OURS: Final = ("daemon", "estimator", "hal", "taps")
+"""Packages of this project."""
 PRIORITY: Final = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
 """Priority of syslog(3), by level."""
 LONGEST: Final = 32_768
@@ -47,10 +50,28 @@ class Sparing:
         self._log.log(level, "%s%s", text, f" ({more} more such lines were left out before it)" if more else "")
 
 
+class _ZonedTime(logging.Formatter):
+    """Lines with date, time and zone (ISO 8601, to the millisecond)."""
+
+    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # logging's name
+        return datetime.fromtimestamp(record.created).astimezone().isoformat(" ", "milliseconds")
+
+
+def set_level(level: str) -> None:
+    """Log from this level on: debug, info, warning or error. Lines of other packages than ours stay as they are.
+
+    It also holds for commands without a log, whose warnings Python prints on stderr.
+    """
+    for name in OURS:
+        logging.getLogger(name).setLevel(level.upper())
+    if logging.lastResort is not None:
+        logging.lastResort.setLevel(level.upper())
+
+
 def start_log() -> None:
     """Start logging: to the journal where stderr is its own stream, otherwise to stderr with the time of day."""
     handler: logging.Handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter(TERMINAL_FORMAT))
+    handler.setFormatter(_ZonedTime(TERMINAL_FORMAT))
     if to_journal():
         handler.setFormatter(_PriorityFormat("%(message)s"))
         handler = JournalHandler(JOURNAL, handler)

@@ -14,10 +14,10 @@ import zenoh
 
 from daemon.cli.status import address_of
 from daemon.publish.modbus.client import NoAnswer
+from daemon.publish.modbus.command_client import CommandRefused, switch_map
 from daemon.system import console
 from daemon.system.atomic_file import reason_of
 from hal.run_server import run_until_stopped
-from taps.command_client import CommandRefused, switch_map
 from taps.fleet import messages
 from taps.fleet.messages import SHARED, Unreadable, printable
 from taps.fleet.placing import (

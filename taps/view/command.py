@@ -64,7 +64,7 @@ def _show(args: argparse.Namespace, guard: Guard) -> int:
         modbus = address_of(None, settings) if settings.modbus.port else ("127.0.0.1", 0)
         stream = Stream(args.stream or settings.name, TOPICS)
         view = View(
-            guard, scene_of(settings), stream, modbus=modbus, again=partial(_scene, args.config, tuple(args.set))
+            guard, scene_of(settings), stream, modbus=modbus, again=partial(_scene, args.source.file, tuple(args.set))
         )
         return _serve(view, guard, args.port, f"lumiloop {settings.name}")
     if args.write:

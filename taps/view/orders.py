@@ -11,9 +11,9 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from daemon.publish.modbus.command_client import CommandClient, CommandRefused, connect
 from daemon.publish.modbus.holding import COMMAND_ADDRESS, CommandCode
 from daemon.publish.stream.client import Stream
-from taps.command_client import CommandClient, CommandRefused, connect
 
 FARTHEST_M: Final = 100_000.0
 

@@ -18,11 +18,11 @@ from typing import Any, Final
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from daemon.publish.modbus.command_client import CommandRefused
 from daemon.publish.stream.client import Lost, Stream
 from daemon.publish.stream.messages import Hello, NotTheStream, Refused
 from hal.net.peers import full_for, host_of, largest, most_of
 from taps.access_guard import HEADERS, Guard
-from taps.command_client import CommandRefused
 from taps.view.orders import Orders
 from taps.view.page_hello import Scene, SceneUnreadable, welcome
 from taps.view.replay_file import ReplayFile

@@ -29,13 +29,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from daemon.cli.tap_parsers import demo_arguments
 from daemon.publish.modbus.client import NoAnswer, Reader, Reading
 from daemon.snapshot import State
 from tools.demo.acts import ROBOT, OrderRefused, Stage, complaint, keyboard, pressed, programme
 from tools.demo.score import READY, Score, Track, cause, pose_of, summary, verdict
 
 ROOT: Final = Path(__file__).parents[2]
-OUT: Final = Path("out/demo")
 READ_PERIOD_S: Final = 0.05
 LINE_PERIOD_S: Final = 1.0
 COLD_START_S: Final = 300.0
@@ -348,17 +348,12 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
 def main(arguments: list[str] | None = None) -> int:
     """Run the demo; 0 if the pose was good, 1 if not, 130 if interrupted before there was anything to show."""
     parser = argparse.ArgumentParser(prog="python -m tools.demo", description=__doc__.splitlines()[0])
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--seconds", type=float, default=75.0, help="how long to watch (default %(default)s)")
-    length.add_argument(
-        "--forever", action="store_const", const=0.0, dest="seconds", help="until Ctrl-C; records 0.3 GB an hour"
-    )
-    parser.add_argument("--dark", action="store_true", help="without lamps: lidar and odometry alone")
-    parser.add_argument("--kidnap", action="store_true", help="carry the robot away instead of switching sensors off")
-    parser.add_argument("--building", default="paper_room", help="see `python -m tools.sim --help`")
-    parser.add_argument("--seed", type=int, default=0, help="of noise, slip and people")
-    parser.add_argument("--out", type=Path, default=OUT, help="where results go (default %(default)s)")
-    options = parser.parse_args(arguments)
+    demo_arguments(parser)
+    return run(parser.parse_args(arguments))
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the demo with these options, those of :func:`daemon.cli.tap_parsers.demo_arguments`."""
     out = options.out.absolute()
     out.mkdir(parents=True, exist_ok=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -9,9 +9,7 @@ No call waits for a client, and without clients nothing is encoded: a tap that h
 from __future__ import annotations
 
 import asyncio
-import errno
 import os
-import socket
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -20,10 +18,10 @@ import msgspec
 import numpy as np
 
 from daemon.maps.tiles import NOTHING_SHOWN, RESOLUTION_M, MapTiles
+from daemon.publish.local_socket import listening
 from daemon.publish.stream.session import CLIENTS, LATEST, ONCE, RAW, SCHEMA, TOPICS, Client, encode, framed
 from daemon.snapshot import Snapshot
 from hal.adc import RawSamples
-from hal.errors import DeviceRefused
 from hal.lidar import VALID, RawScan
 from hal.net.fair_share import Share
 
@@ -102,13 +100,9 @@ class StreamServer:
         Raises:
             DeviceRefused: another program serves it, or it cannot be made.
         """
-        try:
-            listening = self._bind()
-        except OSError as error:
-            problem = error.strerror or str(error)
-            remedy = "free the path, or give write access to its folder"
-            raise DeviceRefused(f"stream {self.path}", problem, remedy) from None
-        server = await asyncio.get_running_loop().create_unix_server(lambda: Client(self), sock=listening)
+        # every user may connect, because the stream is read-only; the folder's permissions limit access
+        sock = listening("stream", self.path, 0o666, CLIENTS)
+        server = await asyncio.get_running_loop().create_unix_server(lambda: Client(self), sock=sock)
         try:
             await asyncio.Event().wait()
         finally:
@@ -116,25 +110,6 @@ class StreamServer:
             for client in list(self.clients):
                 client.drop()
             self.path.unlink(missing_ok=True)
-
-    def _bind(self) -> socket.socket:
-        """The listening socket; the socket file of a dead program is removed first."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path.is_socket():
-            if _alive(self.path):
-                raise DeviceRefused(f"stream {self.path}", "another program serves it", "stop that one")
-            self.path.unlink()
-        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
-        try:
-            listening.bind(str(self.path))
-            self.path.chmod(
-                0o666
-            )  # every user may connect, because the stream is read-only; the folder's permissions limit access
-            listening.listen(CLIENTS)
-        except OSError:
-            listening.close()
-            raise
-        return listening
 
     def hello(self) -> dict[str, object]:
         """First message to a client."""
@@ -230,11 +205,6 @@ class StreamServer:
             body = encode(data())
             for client in wanting:
                 client.tell(topic, body)
-
-
-def _alive(path: Path) -> bool:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as sock:
-        return sock.connect_ex(str(path)) in (0, errno.EAGAIN)  # EAGAIN: a program listens, and its queue is full
 
 
 def _fields(record: object) -> dict[str, Any]:

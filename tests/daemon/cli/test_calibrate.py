@@ -170,14 +170,16 @@ def test_a_configuration_is_not_overwritten_unasked(
     driven: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "robot.toml"
-    out.write_text("name = 'mine'\n")
+    out.write_text("# hall 3\nname = 'mine'\n")
     words = ["calibrate", "teach", "--lidar-mount", "--out", str(out)]
     assert parser.main(words) == console.FAILED
     assert "--force" in capsys.readouterr().err
-    assert out.read_text() == "name = 'mine'\n"
+    assert out.read_text() == "# hall 3\nname = 'mine'\n"
     assert [file.name for file in tmp_path.iterdir()] == ["robot.toml"]
     assert parser.main([*words, "--force"]) == console.OK
     assert load(out).name == "r7"
+    assert "# hall 3\n" in out.read_text(), "comments of the file stay"
+    assert out.read_text().startswith("# Configuration of the drive")
     assert parser.main([*words[:-1], str(tmp_path / "nowhere" / "robot.toml")]) == console.FAILED
     assert "cannot write" in capsys.readouterr().err
 

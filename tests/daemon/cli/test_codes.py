@@ -91,7 +91,7 @@ def test_the_profiles_offered_are_all_there_are(capsys: pytest.CaptureFixture[st
     assert sorted(PROFILES) == sorted(DEGREES)
     with pytest.raises(SystemExit):
         parser.main(["codes", "--profile", "C"])
-    assert "'A', 'B', 'D'" in capsys.readouterr().err
+    assert "name A, B, D" in capsys.readouterr().err
 
 
 def test_no_kernel_is_loaded() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from daemon.cli.explain import entries, find
 from daemon.cli.parser import main, parser
 from daemon.config.loader import options
 from daemon.config.schema import Config
-from daemon.health.faults import FAULTS
+from daemon.health.faults import FAULTS, Fault
 from daemon.health.reasons import REASONS
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.modbus import holding
@@ -27,6 +29,17 @@ def test_a_key_by_its_path_and_by_its_last_part(capsys: pytest.CaptureFixture[st
     assert "default 0.0" in by_path
     assert _told(capsys, "alert_m") == by_path
     assert _told(capsys, "`alert_m`") == by_path
+
+
+def test_a_program_reads_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    told = json.loads(_told(capsys, "fault", "101", "--json"))
+    text, remedy = FAULTS[Fault(101)]
+    assert told["schema"] == "lumiloop.explain/1"
+    assert told["entries"] == [
+        {"kind": "fault", "name": Fault(101).name, "numbers": [101, 101], "text": text, "remedy": remedy}
+    ]
+    assert main(["explain", "trakking", "--json"]) == FAILED
+    assert "did you mean tracking" in json.loads(capsys.readouterr().out)["hint"]
 
 
 def test_a_table_gives_its_keys(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -30,6 +31,19 @@ def test_check_good_and_bad(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     file.write_text("[modbus]\nport = 'x'\n")
     assert parser.main(["check", str(file)]) == console.USAGE
     assert capsys.readouterr().err.startswith(f'lumiloop: {file}:2: `modbus.port` = "')
+
+
+def test_a_program_reads_what_check_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text("[modbus]\nport = 5020\n")
+    assert parser.main(["check", str(file), "--json"]) == console.OK
+    told = json.loads(capsys.readouterr().out)
+    assert (told["schema"], told["file"], told["good"]) == ("lumiloop.check/1", str(file), True)
+    file.write_text("[modbus]\nport = 'x'\n")
+    assert parser.main(["check", str(file), "--json"]) == console.USAGE
+    told = json.loads(capsys.readouterr().out)
+    assert told["good"] is False
+    assert told["problems"][0].startswith(f"{file}:2: `modbus.port`")
 
 
 @pytest.mark.parametrize("words", [["check", "robot.toml"], ["--print-config"], ["run", "--print-config"]])

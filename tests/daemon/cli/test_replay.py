@@ -97,6 +97,13 @@ def test_the_summary_counts_and_names_what_was_used(out: Path, log: Path, run: D
     assert timing["times_real_time"] > 0
 
 
+def test_a_program_reads_the_summary(out: Path, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert parser.main(["replay", str(log), "--out", str(tmp_path / "json"), "--json"]) == console.OK
+    told = json.loads(capsys.readouterr().out)
+    assert told["schema"] == "lumiloop.replay/1"
+    assert told == summary_of(out)
+
+
 def test_the_map_has_walls_where_the_room_has_them(out: Path, run: Drive) -> None:
     from tests.daemon.replay.test_results import load_like_map_server
 

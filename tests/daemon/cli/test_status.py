@@ -19,8 +19,11 @@ import pytest
 
 from daemon.cli import status as cli_status
 from daemon.cli import status_table
+from daemon.cli.reports.status import as_object
 from daemon.config.schema import Config, ModbusConfig
 from daemon.publish.modbus import client, lights_block, registers
+from daemon.publish.modbus.parts_block import PARTS
+from daemon.publish.modbus.requests import BLOCKS
 from daemon.snapshot import Snapshot, State
 from tests.daemon.publish.modbus.test_lights_block import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
@@ -144,21 +147,67 @@ def test_numbers_of_a_newer_daemon_are_shown_as_they_are(capsys: pytest.CaptureF
 def test_a_program_reads_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_against(snapshot(reason=0, fault=0), json=True) == 0
     reading = json.loads(capsys.readouterr().out)
-    assert reading["state"] == "TRACKING"
-    assert reading["map_x"] == 1.2345
+    assert (reading["schema"], reading["state"]) == ("lumiloop.status/1", "TRACKING")
+    assert reading["pose"]["map"] == {"x_m": 1.2345, "y_m": -2.3456, "yaw_rad": 3.0}
     assert reading["flags"]["loop_closed"] is True
     assert reading["devices"]["adc_fitted"] is False
-    assert reading["stalled"] is False
+    assert reading["snapshot"]["stalled"] is False
+    assert reading["snapshot"]["time"] == "2023-11-14T22:13:20.250+00:00"
+    assert reading["faults"] == []
+    assert reading["reason"]["number"] == 0
+
+
+def test_every_published_value_is_in_the_report() -> None:
+    """Each is changed by itself; the report has to change with it."""
+    taken = snapshot(light=picture(), links=3)
+    reading = registers.decode_block(registers.encode_block(taken))
+    for block in BLOCKS:
+        reading |= block.decode(block.encode(taken)) | {"seq": reading["seq"]}
+    before = as_object(reading, stalled=False)
+    ways = {name: 1.0 if value is None else float(value) + 1.0 for name, value in reading.items()}
+    rows = {f"link_{row}" for row in range(4, 17)}  # of no link
+    ways = {name: way for name, way in ways.items() if name.rpartition("_")[0] not in rows}
+    same = {name for name in ways if as_object(reading | {name: ways[name]}, stalled=False) == before}
+    assert same <= {"seq_end", "heartbeat", "faults", "fault_1", "magic", "version"}, (
+        "derived, or for the protocol only"
+    )
+
+
+def test_a_report_names_the_units() -> None:
+    taken = snapshot(light=picture(), links=3)
+    reading = registers.decode_block(registers.encode_block(taken))
+    for block in BLOCKS:
+        reading |= block.decode(block.encode(taken)) | {"seq": reading["seq"]}
+
+    def numbers(tree: Any) -> Iterator[str]:
+        for key, value in tree.items():
+            rows = value if isinstance(value, list) else [value]
+            for row in rows:
+                if isinstance(row, dict):
+                    yield from numbers(row)
+                elif isinstance(row, float):
+                    yield key
+
+    plain = {"x_y", "x_yaw", "y_yaw", "gap", "residual_ln", "floor_share", "sample_clock_ppm"}
+    units = ("_m", "_rad", "_s", "_hz", "_a", "_m_per_s", "_rad_per_s")
+    found = {key for key in numbers(as_object(reading, stalled=False)) if not key.endswith(units)} - plain
+    counts = {key for key in found if key in COUNTS or key.startswith(("keyframe", "restarts"))}
+    assert found - counts - {part.name.lower() for part in PARTS} == set()
+
+
+COUNTS = {
+    *("seq", "jumps", "count", "hypotheses", "in_view", "strongest_lamp", "used", "blocks", "blocks_lost", "code"),
+    *("lamp", "missed", "overruns", "thinned", "without_map", "carried"),
+}
 
 
 def test_a_program_reads_the_links(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_against(snapshot(reason=0, fault=0, light=picture()), advance=False, json=True) == 0
-    reading = json.loads(capsys.readouterr().out)
-    assert reading["light_fix"] == "GOOD"
-    assert reading["light_x"] == -1.2345
-    assert reading["light_links"][1] == {"code": 60, "lamp": None, "use": "TWIN", "strength": 5e-7, "residual": None}
-    assert len(reading["light_links"]) == 3
-    assert not [key for key in reading if key.startswith("link_")]
+    lights = json.loads(capsys.readouterr().out)["lights"]
+    assert lights["fix"] == "GOOD"
+    assert lights["pose"]["x_m"] == -1.2345
+    assert lights["links"][1] == {"code": 60, "lamp": None, "use": "TWIN", "strength_a": 5e-7, "residual_ln": None}
+    assert len(lights["links"]) == 3
 
 
 @contextmanager
@@ -245,7 +294,7 @@ def test_whose_registers_are_shown_is_said(
         assert status(None, settings) == 0, "whoever is meant does not run, or cannot be seen"
         assert capsys.readouterr().out.startswith(f"daemon     process {os.getpid()}: ")
         assert status(None, settings, json=True) == 0
-        assert json.loads(capsys.readouterr().out)["process"] == os.getpid()
+        assert json.loads(capsys.readouterr().out)["daemon"]["process"] == os.getpid()
         with another_process(tmp_path / "agv.stream") as meant:
             assert status(None, settings) == 1
             said = capsys.readouterr()

@@ -27,7 +27,7 @@ def test_watching_goes_on_until_interrupted(
     with stranger(registers.encode_block(snapshot(reason=0, fault=0))) as address, pytest.raises(KeyboardInterrupt):
         status(address, watch=True, json=True)
     lines = capsys.readouterr().out.splitlines()
-    assert [json.loads(line)["stalled"] for line in lines] == [False, True, True, True]
+    assert [json.loads(line)["snapshot"]["stalled"] for line in lines] == [False, True, True, True]
 
 
 def test_watching_shows_when_the_daemon_is_away(

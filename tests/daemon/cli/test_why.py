@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from datetime import UTC, datetime
 from pathlib import Path
@@ -318,3 +319,16 @@ def test_a_folder_that_is_not_there_is_said_to_be_none(
     assert parser.main(["why", "3", str(tmp_path / named)]) == 1
     said = capsys.readouterr().err
     assert f"{tmp_path / named}: no such folder (name a recording, a dump, or a folder of several)" in said
+
+
+def test_a_program_reads_the_same(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (dump,) = recorded.glob(f"{DUMP}*-fault-101")
+    told = json.loads(asked("2023-11-14T22:13:25Z", dump, capsys, "--json"))
+    assert (told["schema"], told["state"]) == ("lumiloop.why/1", "NO_LIDAR")
+    assert told["asked"]["time"] == "2023-11-14T22:13:25.000+00:00"
+    assert told["reason"]["number"] == 3
+    assert [fault["number"] for fault in told["faults"]] == [101]
+    assert told["known"]["x"] in (True, False)
+    assert told["witnesses"]["laser"]["points"] > 0
+    assert any(change["published"] and "fault 101 comes" in change["text"] for change in told["changes"])
+    assert all(change["time"].endswith("+00:00") for change in told["changes"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
 from pathlib import Path
@@ -213,6 +214,13 @@ def test_the_command_writes_a_survey_that_it_can_judge_again(
         line for line in again.splitlines() if line.startswith("laser and light")
     ]
     assert not (tmp_path / "b" / "lights.toml").exists()
+    assert parser.main([*judged, "--json"]) == console.OK
+    told = json.loads(capsys.readouterr().out)
+    assert (told["schema"], told["lamps"]["count"]) == ("lumiloop.plan/1", 9)
+    places = {(lamp.x, lamp.y) for lamp in survey.lamps}
+    assert {(at["x_m"], at["y_m"]) for at in told["lamps"]["positions"]} == places
+    median = 100.0 * told["accuracy"]["laser_and_light"]["median_m"]
+    assert f"laser and light: median {median:.1f} cm" in again
 
 
 @pytest.mark.parametrize(("width", "depth"), [(40.0, 2.2), (2.2, 30.0)])

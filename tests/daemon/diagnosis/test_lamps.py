@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.cli.lamps import tell
+from daemon.cli.lamps.history import tell
 from daemon.config.schema import Config, MapConfig
 from daemon.diagnosis.host import Heard, Mute
 from daemon.diagnosis.lamp_history import DAY_S, BadHistory, Look, by_lamp, in_maps, load, merged, save

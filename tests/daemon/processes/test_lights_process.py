@@ -116,11 +116,11 @@ def _status_shows_the_links(modbus: int) -> None:
         assert f" {code} " in shown
     assert "light fix" in shown
     assert "devices    adc ok" in shown
-    reading = json.loads(status(modbus, "--json"))
-    assert {link["code"] for link in reading["light_links"]} >= set(CODES)
-    strengths = [link["strength"] for link in reading["light_links"]]
+    lights = json.loads(status(modbus, "--json"))["lights"]
+    assert {link["code"] for link in lights["links"]} >= set(CODES)
+    strengths = [link["strength_a"] for link in lights["links"]]
     assert strengths == sorted(strengths, reverse=True)
-    assert reading["sample_clock"] == pytest.approx(-1e6 * SCL_ERROR, abs=200.0)
+    assert lights["sample_clock_ppm"] == pytest.approx(-1e6 * SCL_ERROR, abs=200.0)
 
 
 def test_a_bad_survey_stops_the_start_with_its_place(tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ def test_a_lidar_in_a_pose_out(tmp_path: Path) -> None:
         assert resident_mb(daemon.process) < RESIDENT_MB
         command = [sys.executable, "-m", "daemon", "status", f"127.0.0.1:{daemon.modbus}", "--json"]
         told = json.loads(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout)
-        assert told["state"] in (int(State.TRACKING), State.TRACKING.name)
+        assert (told["schema"], told["state"]) == ("lumiloop.status/1", State.TRACKING.name)
         code, log, seconds = daemon.stop()
         assert code == 0
         assert seconds < 3.0

@@ -37,10 +37,11 @@ class Bench:
         feeds = Feeds(lambda _: None, lambda _: None, self.commands.append, self.saves.append, **able)
 
         self.clock = Clock()
-        self.orders = Orders(self.clock, feeds, lambda number, outcome: self.ended.append((number, outcome)))
+        self.orders = Orders(self.clock, feeds)
 
     def ask(self, number: int, code: CommandCode, map_id: int = 0) -> None:
-        self.orders.handle(Request(number, code, (1.0, 2.0, 0.5), map_id))
+        request = Request(number, code, (1.0, 2.0, 0.5), map_id)
+        self.orders.handle(request, lambda outcome, _: self.ended.append((number, outcome)))
 
 
 @pytest.mark.parametrize("order", [Order.SET_POSE, Order.RESET, Order.RELOCALISE])

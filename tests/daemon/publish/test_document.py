@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
+import struct
 from pathlib import Path
 
 import pytest
 
 from daemon.publish import document
 from daemon.publish.modbus import registers
+from daemon.publish.modbus.holding import CommandCode, Holding, Request
 
+ROOT = Path(__file__).parents[3]
 DOCS = Path(__file__).parents[3] / "docs"
 
 
@@ -26,6 +30,29 @@ def test_every_point_is_documented_where_it_is() -> None:
         assert f"| {8 + 2 * offset} | `{point.name}` | {point.wire.name} |" in udp
     for number, mirrored in enumerate(registers.MIRROR):
         assert f"| {102 + 2 * number} | `{mirrored.name}` | float32 |" in modbus
+
+
+def test_the_lines_of_mbpoll_give_every_order() -> None:
+    """Each is carried out as mbpoll would: 16-bit words, or with `-t 4:int -B` 32-bit ones, high word first."""
+    given: list[Request] = []
+    holding = Holding(given.append, lambda _: None)
+    page = document.modbus_page()
+    for kind, address, values in re.findall(
+        r"^ +mbpoll -m tcp .*-t 4(\S*)(?: -B)? -0 -r (\d+) HOST ([^#\n]+)", page, re.M
+    ):
+        numbers = [int(value, 0) for value in values.replace("--", "").split()]
+        holding.write(int(address), struct.pack(f">{len(numbers)}{'i' if kind == ':int' else 'H'}", *numbers))
+    assert [request.code for request in given] == list(CommandCode)
+    assert given[0].pose == (1.5, -2.0, 1.570796)
+    assert given[-1].map_id == 0x1A2B3C4D
+
+
+def test_every_line_of_mbpoll_counts_from_0() -> None:
+    pages = {path: path.read_text() for path in [ROOT / "README.md", *DOCS.rglob("*.md")]}
+    lines = {(path.name, line) for path, text in pages.items() for line in re.findall(r"mbpoll [^`\n]*", text)}
+    asking = {(page, line) for page, line in lines if " -r " in line}
+    assert len(asking) > 10
+    assert not {(page, line) for page, line in asking if " -0 " not in line}
 
 
 def test_writing_makes_the_pages(tmp_path: Path) -> None:

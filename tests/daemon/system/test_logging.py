@@ -163,3 +163,14 @@ def test_the_catalog_explains_every_message_id_with_fields_that_are_sent() -> No
         "MESSAGE",
     }
     assert set(re.findall(r"@(\w+)@", text)) <= sent
+
+
+def test_lines_of_a_terminal_have_date_time_and_zone(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    made: list[logging.Handler] = []
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(logging, "basicConfig", lambda level, handlers: made.extend(handlers))
+    system_logging.start_log()
+    record = logging.LogRecord("daemon.part", logging.INFO, "file", 1, "said", (), None)
+    made[0].handle(record)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}[+-]\d\d:\d\d INFO    said\n", stream.getvalue())

@@ -44,6 +44,6 @@ def test_a_daemon_that_takes_no_orders_or_is_not_there_is_said(monkeypatch: pyte
 
     with pytest.raises(Refused, match=r"set `modbus\.write = true`"):
         asyncio.run(refused())
-    monkeypatch.setattr("taps.command_client.ATTEMPT_S", 0.05)
+    monkeypatch.setattr("daemon.publish.modbus.command_client.ATTEMPT_S", 0.05)
     with pytest.raises(Refused, match="does not answer"):
         asyncio.run(switched("agv", ("127.0.0.1", free_port()), 1))

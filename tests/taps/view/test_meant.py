@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from daemon.config.paths import stream_path
+from daemon.publish.modbus.command_client import CommandRefused, switch_map
 from taps.access_guard import Guard
-from taps.command_client import CommandRefused, switch_map
 from tests.taps.view.house import TOKEN, serving
 
 OTHER = """

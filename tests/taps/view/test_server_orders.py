@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from daemon.publish.modbus import command_client
 from daemon.publish.modbus.holding import COMMAND_ADDRESS, CommandCode, Outcome, Request
-from taps import command_client
 from taps.access_guard import Guard
 from taps.view.orders import Orders
 from tests.daemon.publish.network import publishing

@@ -18,8 +18,10 @@ from typing import Any
 
 import pytest
 
+from daemon.cli import parser
 from daemon.snapshot import State
 from tests.rotation import share
+from tools.demo import run
 from tools.demo.acts import Stage, complaint, programme
 from tools.demo.score import Score, Track, in_map, summary, verdict
 
@@ -166,6 +168,17 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={**os.environ, "TMPDIR": str(folder)}
     )
+
+
+def test_the_installed_command_is_the_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(run, "show", lambda options, folder, out: shown.append((options, out)) or 7)
+    monkeypatch.setattr(run.signal, "signal", lambda *_: None)
+    assert parser.main(["demo", "--kidnap", "--seconds", "50", "--out", str(tmp_path / "out")]) == 7
+    assert run.main(["--kidnap", "--seconds", "50", "--out", str(tmp_path / "out")]) == 7
+    (options, out), (same, _) = shown
+    assert (options.kidnap, options.seconds, out) == (True, 50.0, tmp_path / "out")
+    assert vars(same).items() <= vars(options).items()
 
 
 @pytest.mark.system

@@ -7,6 +7,7 @@ import zlib
 
 import estimator.result
 from daemon.cli import status_table
+from daemon.cli.reports.status import as_object
 from daemon.publish.modbus import integrity_block, registers
 from daemon.runtime.snapshot_builder import LOOPS
 from daemon.snapshot import LoopReason, Trust
@@ -76,7 +77,7 @@ def test_status_shows_the_bound() -> None:
     assert "bound      0.124 m, 2.01 deg (laser, wheels)  ALERT, limit 0.500 m" in table
     assert "places     3 fit" in table
     assert "residual 0.0123 m" in table
-    assert status_table.as_object(reading, stalled=False)["witnesses"]["alert"] is True
+    assert as_object(reading, stalled=False)["integrity"]["witnesses"]["alert"] is True
     reading = registers.decode_block(registers.encode_block(snapshot()))
     reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(snapshot()))
     assert "bound      none" in status_table.as_table(reading, stalled=False)

@@ -9,11 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, cast
 
-from daemon.publish.modbus.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome
+from daemon.publish.modbus.holding import COMMAND, COMMAND_ADDRESS, CommandCode, Outcome, Request
 from daemon.publish.port_owner import whose
 from hal.blocking_calls import run_in_thread
 
 MAP_ADDRESS: Final = COMMAND_ADDRESS + 10
+STEPS: Final = (1e4, 1e4, 1e6)
+"""Steps of the registers of a pose, per m and per rad."""
 ATTEMPTS: Final = 4
 ATTEMPT_S: Final = 0.3
 POLL_S: Final = 0.1
@@ -94,14 +96,14 @@ class CommandClient(asyncio.DatagramProtocol):
         ours = registers[2:].startswith(written) and registers.endswith(map_id)
         return ours, acknowledged == number and outcome is not Outcome.RUNNING, outcome
 
-    async def wait_for_end(self, written: bytes, map_id: bytes = b"") -> str:
-        """Poll until the command ends: its outcome in lower case, ``replaced``, or ``no end seen`` after 60 s.
+    async def wait_for_end(self, written: bytes, map_id: bytes = b"", longest_s: float = LONGEST_S) -> str:
+        """Poll until the command ends: its outcome in lower case, ``replaced``, or ``no end seen`` after that time.
 
         Raises:
             CommandRefused: the server does not answer.
         """
         loop = asyncio.get_running_loop()
-        end = loop.time() + LONGEST_S
+        end = loop.time() + longest_s
         while loop.time() < end:
             ours, ended, result = await self.outcome(written, map_id)
             if not ours:
@@ -141,21 +143,41 @@ async def connect(host: str, port: int) -> CommandClient:
     return client
 
 
-async def switch_map(name: str, host: str, port: int, map_id: int) -> str:
-    """Switch the daemon of that name to another stored map; returns the outcome as :meth:`CommandClient.wait_for_end`.
+async def give(host: str, port: int, request: Request, daemon: str | None, longest_s: float = LONGEST_S) -> str:
+    """Send a command and wait for its end; returns the outcome as :meth:`CommandClient.wait_for_end`.
+
+    ``daemon``: name of the one that must own the port; None: any. The number of ``request`` is chosen here.
 
     Raises:
         CommandRefused: the command cannot be sent.
     """
     client = await connect(host, port)
     try:
-        await client.require_owner(name)
+        if daemon is not None:
+            await client.require_owner(daemon)
         number = await client.next_number()
-        target = struct.pack(">I", map_id)
-        await client.request(struct.pack(">BHHB", 16, MAP_ADDRESS, 2, 4) + target)
-        written = struct.pack(">HH", number, CommandCode.SWITCH_MAP)
-        await client.request(struct.pack(">BHHB", 16, COMMAND_ADDRESS, 2, 4) + written)
-        return await client.wait_for_end(written, target)
+        target = b""
+        if request.code is CommandCode.SWITCH_MAP:
+            target = struct.pack(">I", request.map_id)
+            await client.request(struct.pack(">BHHB", 16, MAP_ADDRESS, 2, 4) + target)
+        written = struct.pack(">HH", number, request.code)
+        if request.code is CommandCode.SET_POSE:
+            written += pose_registers(request.pose)
+        await client.request(struct.pack(">BHHB", 16, COMMAND_ADDRESS, len(written) // 2, len(written)) + written)
+        return await client.wait_for_end(written, target, longest_s)
     finally:
         client.close()
         await asyncio.sleep(0)  # the loop closes the socket one turn later
+
+
+def pose_registers(pose: tuple[float, float, float]) -> bytes:
+    """A pose (m, m, rad) in the registers' steps; raises `CommandRefused` where they cannot hold it."""
+    try:
+        return struct.pack(">iii", *(round(scale * value) for scale, value in zip(STEPS, pose, strict=True)))
+    except (struct.error, OverflowError, ValueError):
+        raise CommandRefused("the registers hold poses within 200000 m and 2000 rad") from None
+
+
+async def switch_map(name: str, host: str, port: int, map_id: int) -> str:
+    """Switch the daemon of that name to another stored map; otherwise as :func:`give`."""
+    return await give(host, port, Request(0, CommandCode.SWITCH_MAP, (0.0, 0.0, 0.0), map_id), name)

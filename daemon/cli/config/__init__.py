@@ -1,0 +1,1 @@
+"""``lumiloop config``: makes, shows and changes a configuration file."""

@@ -1,0 +1,186 @@
+"""Help on one screen, examples that run, suggestions, completion in a real shell, and man pages."""
+
+from __future__ import annotations
+
+import logging
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from daemon.cli import parser
+from daemon.cli.manual.catalogue import EXAMPLES, GROUPS
+from daemon.cli.manual.command_parser import every, subcommands
+from daemon.cli.manual.completion import script
+from daemon.system import console
+from daemon.system import logging as our_logging
+
+ROOT = Path(__file__).parents[4]
+NAMES = sorted(subcommands(parser.parser()))
+
+
+@pytest.mark.parametrize("words", [["--help"], ["help"], ["-h"]])
+def test_the_help_fits_one_screen(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    if words == ["help"]:
+        assert parser.main(words) == console.OK
+    else:
+        with pytest.raises(SystemExit) as ended:
+            parser.main(words)
+        assert ended.value.code == console.OK
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 24
+    assert max(map(len, lines)) <= 80
+    for name in NAMES:
+        assert any(re.search(rf"^ +.*(?<![\w-]){name}(?![\w-])", line) for line in lines), name
+
+
+def test_every_command_has_a_group_and_two_examples() -> None:
+    grouped = [name for group in GROUPS for name in group.commands]
+    assert sorted(grouped) == NAMES == sorted(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_examples_are_command_lines(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = [line for line, _ in EXAMPLES[name]]
+    for line in lines:
+        args = parser.parser().parse_args(shlex.split(line))
+        assert args.command == name == line.split()[0]
+        assert callable(args.body)
+    assert parser.main(["help", name]) == console.OK
+    said = capsys.readouterr().out
+    assert all(f"  lumiloop {line}\n" in said for line in lines)
+    assert "--log-level" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["staus"], "did you mean status"),
+        (["save_map"], "did you mean save-map"),
+        (["status", "--jsn"], "did you mean --json"),
+        (["map", "imprt", "x.yaml"], "did you mean import"),
+        (["replay", "x", "--out", "y", "--method", "papr"], "did you mean paper"),
+        (["completion", "tcsh"], "name bash, zsh, fish"),
+        (["qqqqqq"], "`lumiloop help all` lists them"),
+    ],
+)
+def test_misspelt_words_are_answered_with_the_nearest(
+    words: list[str], hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        parser.main(words)
+    assert ended.value.code == console.USAGE
+    said = capsys.readouterr().err
+    assert hint in said
+    assert said.count("\n") == 2, "two lines: what is wrong, and where help is"
+
+
+def test_help_of_a_verb_and_of_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert parser.main(["help", "map", "import"]) == console.OK
+    assert "usage: lumiloop map import" in capsys.readouterr().out
+    assert parser.main(["help", "satus"]) == console.USAGE
+    assert "did you mean status" in capsys.readouterr().err
+
+
+def test_levels_stand_before_or_behind_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lumiloop.toml").write_text("")
+    levels = {name: logging.getLogger(name).level for name in our_logging.OURS}
+    try:
+        for words, level in ((["check", "-v"], logging.DEBUG), (["--log-level", "warning", "check"], logging.WARNING)):
+            assert parser.main(words) == console.OK
+            assert {logging.getLogger(name).level for name in our_logging.OURS} == {level}
+            assert "configuration lumiloop.toml" in capsys.readouterr().err
+        assert parser.main(["check", "-q"]) == console.OK
+        out, err = capsys.readouterr()
+        assert out.startswith("lumiloop.toml: good")
+        assert err == ""
+        assert parser.main(["-q", "check", "missing.toml"]) == console.USAGE
+        assert "no such file" in capsys.readouterr().err, "errors are printed all the same"
+    finally:
+        monkeypatch.setattr(console._Output, "quiet", False)
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
+        assert logging.lastResort is not None
+        logging.lastResort.setLevel(logging.WARNING)
+
+
+def completed(line: str, folder: Path) -> set[str]:
+    """What bash offers at the end of a line."""
+    words = line.split(" ")
+    program = (
+        f"source {folder / 'lumiloop.bash'}\n"
+        f"COMP_WORDS=({' '.join(map(shlex.quote, words))})\nCOMP_CWORD={len(words) - 1}\n_lumiloop\n"
+        'printf "%s\\n" "${COMPREPLY[@]}"\n'
+    )
+    done = subprocess.run(["bash", "-c", program], cwd=folder, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return set(done.stdout.split())
+
+
+def test_bash_completes_commands_verbs_and_options(tmp_path: Path) -> None:
+    (tmp_path / "lumiloop.bash").write_text(script("bash", parser.parser()))
+    (tmp_path / "drive.log").touch()
+    assert completed("lumiloop sta", tmp_path) == {"status"}
+    assert completed("lumiloop s", tmp_path) >= {"status", "survey", "set-pose", "save-map", "switch-map"}
+    assert completed("lumiloop map i", tmp_path) >= {"import", "info"}
+    assert completed("lumiloop -v status --j", tmp_path) == {"--json"}
+    assert completed("lumiloop map import --na", tmp_path) == {"--name"}
+    assert completed("lumiloop replay dr", tmp_path) == {"drive.log"}
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_scripts_hold_every_command_and_are_valid(
+    shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert parser.main(["completion", shell]) == console.OK
+    text = capsys.readouterr().out
+    for words, command in every(parser.parser()):
+        assert words[-1] in text
+        for action in command._actions:
+            for option in action.option_strings:
+                assert (f"-l {option[2:]}" if shell == "fish" and option.startswith("--") else option[1:]) in text
+    if (program := shutil.which(shell)) is not None:
+        file = tmp_path / "script"
+        file.write_text(text)
+        subprocess.run([program, "-n", str(file)], check=True)
+
+
+def test_man_pages_of_every_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert parser.main(["man", "--out", str(tmp_path)]) == console.OK
+    assert {path.name for path in tmp_path.iterdir()} == {"lumiloop.1", *(f"lumiloop-{name}.1" for name in NAMES)}
+    page = (tmp_path / "lumiloop-set-pose.1").read_text()
+    assert ".SH NAME\nlumiloop\\-set\\-pose \\- set the robot's pose in the map\n" in page
+    assert ".B lumiloop set\\-pose 1.5 \\-2 90\n" in page
+    for path in tmp_path.iterdir():
+        bad = [line for line in path.read_text().splitlines() if re.match(r"['.](?!TH|SH|SS|TP|PP|BR?\b)", line)]
+        assert not bad, f"{path.name}: {bad}"
+    assert parser.main(["man", "run"]) == console.OK
+    assert capsys.readouterr().out.endswith((tmp_path / "lumiloop-run.1").read_text())
+    assert parser.main(["man", "fly"]) == console.USAGE
+    if (groff := shutil.which("groff")) is not None:
+        pages = [str(path) for path in tmp_path.iterdir()]
+        done = subprocess.run([groff, "-man", "-ww", "-Tascii", *pages], capture_output=True, text=True, check=True)
+        assert done.stderr == ""
+
+
+def test_the_installer_lays_down_pages_and_scripts_and_removes_them(tmp_path: Path) -> None:
+    environment = {"PATH": "/usr/bin:/bin", "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
+    install = str(ROOT / "systemd" / "install.sh")
+    subprocess.run([install, "files"], env=environment, check=True, capture_output=True)
+    share = tmp_path / "usr/share"
+    made = [
+        share / "man/man1/lumiloop.1",
+        share / "man/man1/lumiloop-run.1",
+        share / "bash-completion/completions/lumiloop",
+        share / "zsh/vendor-completions/_lumiloop",
+        share / "fish/vendor_completions.d/lumiloop.fish",
+    ]
+    assert all("lumiloop" in path.read_text() for path in made)
+    subprocess.run([install, "uninstall"], env=environment, check=True, capture_output=True)
+    assert [path for path in share.rglob("*") if path.is_file()] == []
