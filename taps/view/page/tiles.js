@@ -33,27 +33,13 @@ export class Tiles {
     if (tile.number !== number || this.all.get(key) !== tile) return;
     tile.cells = cells && cells.some((cell) => cell !== 0) ? cells : null;
     tile.side = side;
-    tile.picture = tile.box = null;
+    tile.picture = null;
     this.changed();
   }
 
   repaint() {
     for (const tile of this.all.values()) tile.picture = null;
     this.changed();
-  }
-
-  // Bounding box (x0, y0, x1, y1) of the known cells, m; null: none.
-  extent() {
-    let box = null;
-    for (const tile of this.all.values()) {
-      if (!tile.cells) continue;
-      const x = tile.column * this.size, y = tile.row * this.size, m = this.size / tile.side;
-      if (!tile.box) tile.box = filled(tile);
-      if (tile.box[2] === 0) continue;
-      const own = [x + tile.box[0] * m, y + tile.box[1] * m, x + tile.box[2] * m, y + tile.box[3] * m];
-      box = box ? [Math.min(box[0], own[0]), Math.min(box[1], own[1]), Math.max(box[2], own[2]), Math.max(box[3], own[3])] : own;
-    }
-    return box;
   }
 
   draw(context, camera, colours) {
@@ -73,18 +59,6 @@ export class Tiles {
 async function inflated(packed) {
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Int8Array(await new Response(stream).arrayBuffer());
-}
-
-function filled(tile) {
-  const { cells, side } = tile, box = [side, side, 0, 0];   // of occupied cells, not of those seen through a door
-  for (let row = 0, at = 0; row < side; row++) {
-    for (let column = 0; column < side; column++, at++) {
-      if (cells[at] <= 0) continue;
-      box[0] = Math.min(box[0], column); box[1] = Math.min(box[1], row);
-      box[2] = Math.max(box[2], column + 1); box[3] = Math.max(box[3], row + 1);
-    }
-  }
-  return box;
 }
 
 function painted(tile, colours) {

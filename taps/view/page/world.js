@@ -2,7 +2,7 @@
 
 import { Tiles } from "./tiles.js";
 
-const POSES = 64, TRAIL = 8000, STEP_M = 0.02, LEAP_M = 0.6, LOOPS = 200, ROWS = 1200;
+const POSES = 64, TRAIL = 8000, STEP_M = 0.02, LEAP_M = 0.6, LOOPS = 200, ROWS = 1200, MARGIN_M = [2, 8];
 export const COLUMNS = { t: 0, x: 1, y: 2, yaw: 3, sigma: 4, bound: 5, cycle: 6, late: 7, used: 8, state: 9, jumps: 10, map: 11 };
 
 export class World {
@@ -20,7 +20,9 @@ export class World {
     this.loops = [];
     this.rows = [];
     this.faults = [];
+    this.margin = MARGIN_M[0];
     this.lampsPlaced = false;
+    this.chosen = null;      // number of the lamp whose details are shown
     this.dirty = true;
     if (!keepTiles) this.tiles.clear();
   }
@@ -45,7 +47,12 @@ export class World {
   }
 
   on_lights(data) { this.lights = data; }
-  on_scan(data) { this.scan = { ...data, ranges: floats(data.ranges) }; }
+  on_scan(data) {
+    this.scan = { ...data, ranges: floats(data.ranges) };
+    const ranges = this.scan.ranges.filter((range) => range > 0.02 && range < Infinity).sort();
+    this.margin = Math.max(this.margin, Math.min(MARGIN_M[1], ranges[ranges.length >> 1] || 0));
+  }
+
   on_statistics(data) { this.statistics = data; }
   on_faults(data) { this.faults = data.present; }
   on_map(data) { this.tiles.take(data); }
@@ -94,6 +101,18 @@ export class World {
     const part = (t - a.t) / (b.t - a.t);
     if (Math.hypot(b.pose[0] - a.pose[0], b.pose[1] - a.pose[1]) > 0.3) return b.pose;
     return a.pose.map((value, k) => value + part * (k === 2 ? turned(b.pose[2] - a.pose[2]) : b.pose[k] - value));
+  }
+
+  // Bounding box (x0, y0, x1, y1) of where the robot has been, m, with the room about it; null: not known.
+  // The margin is the largest median range of a scan: beams through glass or a door are too few to change it.
+  been() {
+    const places = this.trail.map(({ x, y }) => [x, y]);
+    for (const { at_new: a, at_old: b } of this.loops) for (const at of [a, b]) if (at) places.push(at);
+    if (this.pose && this.pose.pose) places.push(this.pose.pose);
+    if (!places.length) return null;
+    const { margin } = this;
+    const xs = places.map(([x]) => x), ys = places.map(([, y]) => y);
+    return [Math.min(...xs) - margin, Math.min(...ys) - margin, Math.max(...xs) + margin, Math.max(...ys) + margin];
   }
 
   // The latest scan as points of the map, x and y alternating; null: no scan or no pose.
