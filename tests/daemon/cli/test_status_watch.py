@@ -15,7 +15,7 @@ import pytest
 from daemon.publish.modbus import client, registers
 from daemon.snapshot import Snapshot, Trust
 from daemon.system import terminal_screen
-from tests.daemon.cli.test_status import status, stranger
+from tests.daemon.cli.test_status import run_against, status, stranger
 from tests.daemon.publish.modbus.test_lights_block import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
 
@@ -113,16 +113,17 @@ def test_a_small_terminal_shows_state_and_remedy_first_and_cuts_nothing(
     assert "snapshot" in "\n".join(last)
 
 
-def test_on_80_by_24_everything_that_matters_is_on_the_first_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The whole of lights and integrity, a reason and a fault with their remedies."""
-    taken = snapshot(reason=4, fault=101, light=picture(), links=3, trust=Trust(horizontal_m=0.1, light=True))
-    first = on_screen(monkeypatch, taken, 80, 24)[0]
-    assert len(first) <= 24
-    assert max(map(len, first)) <= 80
-    labels = [line.split("  ")[0] for line in first if line[:1] not in (" ", "-")]
-    wanted = ["state", "reason", "map pose", "sigma", "fault", "lights"]
-    assert [label for label in labels if label in wanted] == wanted
+def test_on_80_by_24_everything_that_matters_is_on_the_first_page(capsys: pytest.CaptureFixture[str]) -> None:
+    """A reason and a fault with their remedies, then pose, protection level, faults and lamps, of a real publisher."""
+    trust = Trust(horizontal_m=0.1, yaw_rad=0.02, limit_m=0.3, light=True)
+    assert run_against(snapshot(reason=4, fault=101, light=picture(), links=3, trust=trust), advance=False) == 0
+    whole = terminal_screen.wrapped(capsys.readouterr().out, 80, 11)
+    first = whole[:23]
+    labels = [line[:11].strip() for line in first if line[0] != " "]
+    wanted = ["state", "reason", "map pose", "sigma", "bound", "fault", "lights", "light fix", "light pose", "links"]
+    assert labels[: len(wanted)] == wanted
     assert "check the lidar's power and cable" in " ".join(" ".join(first).split())
+    assert [line for line in whole if " nA" in line] == [line for line in first if " nA" in line] != []
 
 
 def test_keys_scroll_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
