@@ -15,9 +15,10 @@ const LEGEND = [
   ["Map", [
     [cell("free"), "free"], [cell("wall"), "wall or object"], [cell("bg"), "unknown"],
   ]],
-  ["State: robot, trajectory, plots", [
-    [robot("good") + line("good", 'stroke-opacity="0.5"'), "TRACKING"], [robot("teal"), "MAPPING"], [robot("warn"), "DEGRADED"],
+  ["State of the robot", [
+    [robot("good") + line("good", 'stroke-opacity="0.5"'), "TRACKING; the line is the trajectory"], [robot("teal"), "MAPPING"], [robot("warn"), "DEGRADED"],
     [robot("seek"), "AMBIGUOUS, RELOCATING"], [robot("bad"), "LOST, NO LIDAR"], [robot("faint"), "STARTING"],
+    ['<path d="M1 8h9" stroke="var(--teal)" stroke-width="4"/><path d="M10 8h17" stroke="var(--good)" stroke-width="4"/>', "the state over time, in the plots"],
   ]],
   ["Lines", [
     ['<path d="M4 8h.1m6-2h.1m6 3h.1m6-1h.1" stroke="var(--scan)" stroke-width="4" stroke-linecap="square"/>', "latest scan"],

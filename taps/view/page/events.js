@@ -52,10 +52,16 @@ export class Events {
   on_past(list) { for (const one of list) this.on_faults(one); }
 
   on_faults({ present, t_mono }) {
-    const t = t_mono ?? (this.world.pose ? this.world.pose.t_mono : 0), now = new Map(present.map((one) => [one.fault, one]));
+    const { pose, rows } = this.world, now = new Map(present.map((one) => [one.fault, one]));
+    const t = t_mono ?? (pose ? pose.t_mono : rows.length ? rows[0][COLUMNS.t] : null);
+    if (t !== null) this.compare(now, t);
+    this.faults = now;
+  }
+
+  // Faults that have appeared or gone since the last message.
+  compare(now, t) {
     for (const [number, one] of now) if (!this.faults.has(number)) this.add(t, `Fault ${number}${one.cause ? ` (from ${one.cause})` : ""}: ${plain(one.meaning)}`, one.cause ? "dim" : "bad");
     for (const [number, one] of this.faults) if (!now.has(number)) this.add(t, `Fault ${number} cleared: ${plain(one.meaning)}`, "good");
-    this.faults = now;
   }
 
   on_loops(loops) { for (const one of loops) this.on_loop(one); }

@@ -32,7 +32,7 @@ export class Orders {
       button.title = (words.orders[button.dataset.order] || "").replaceAll("`", "");
     }
     $("mode").hidden = Boolean(words.recording);
-    $("mode").textContent = may.length ? "commands on" : "read-only";
+    $("mode").textContent = may.length ? "control" : "read-only";
     $("mode").classList.toggle("write", may.length > 0);
     $("write-note").textContent = may.length ? `you are viewer ${this.you}` : "";
   }

@@ -32,7 +32,7 @@ export class Tools {
     if (open) legend($("legend"), this.world.scene.lamps.length > 0);
     $("legend").hidden = !open;
     $("legend-open").setAttribute("aria-expanded", String(open));
-    const width = open ? $("legend").offsetWidth + 24 : 0;
+    const width = open ? $("legend").offsetWidth + 74 : 0;
     this.camera.covered = width < this.camera.width / 2 ? width : 0;
     this.camera.changed();
     if (chosen) localStorage.setItem(LEGEND, open ? "open" : "closed");

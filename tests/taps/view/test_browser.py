@@ -212,7 +212,7 @@ def test_a_token_that_is_pasted_after_a_refusal_is_tried(browser: str, address: 
         await page.js("lumiloop.link.refused = 'token'; lumiloop.link.socket.close()")
         await page.until("lumiloop.link.socket === null")
         await page.js(f"location.hash = {address.partition('#')[2]!r}")
-        await page.until("lumiloop.link.socket && document.getElementById('mode').textContent === 'commands on'", 20.0)
+        await page.until("lumiloop.link.socket && document.getElementById('mode').textContent === 'control'", 20.0)
 
     look(browser, address.partition("#")[0], body)
 

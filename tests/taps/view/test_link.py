@@ -97,7 +97,7 @@ async def test_a_dead_wire_is_no_daemon_that_stands_and_the_page_comes_back(brow
         await page.click("[data-order=relocalise]")
         await page.click("#confirm-yes")  # into a wire that takes it
         await page.js(f"globalThis.told = []; setInterval(() => told.push({BANNER}), 50); 0")
-        await shows(page, "No connection to this page")
+        await shows(page, "No connection to the page")
         assert not [text for text in await page.js("told") if "the daemon does not respond" in text]
         await page.until("document.getElementById('state-name').textContent === 'NO SERVER'")
         await page.until("document.getElementById('told').textContent.includes('connection lost')")

@@ -141,6 +141,9 @@ def test_the_state_is_seen_at_once(browser: str, tmp_path: Path) -> None:
         listed = await text(page, "#legend")
         for word in ("free", "unknown", "TRACKING", "latest scan", "protection level", "loop closure", "occluded"):
             assert word in listed
+        apart = "((a, b) => a.right <= b.left || a.bottom <= b.top || b.bottom <= a.top)"
+        boxes = ", ".join(f"document.querySelector('{name}').getBoundingClientRect()" for name in (".legend", ".tools"))
+        assert await page.js(f"{apart}({boxes})")  # nothing is covered
         heads = await page.js("[...document.querySelectorAll('.link.heads span')].map((one) => one.textContent)")
         assert heads == ["lamp", "use", "RSS", "residual"]
         await page.js("lumiloop.link.take = () => {}")
