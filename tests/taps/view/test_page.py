@@ -124,6 +124,9 @@ def test_every_text_can_be_read(browser: str, tmp_path: Path, size: tuple[int, i
         seen, unreadable = await page.js(UNREADABLE)
         assert seen > 100
         assert unreadable == []
+        await page.js("document.documentElement.style.setProperty('--dim', '#767b85')")
+        assert (await page.js(UNREADABLE))[1] != []  # of what cannot be read it says so
+        await page.js("document.documentElement.style.removeProperty('--dim')")
         for opener, dialog in (("#help", "keys"), ("[data-order=pause]", "confirm")):
             await page.js(f"document.querySelector({opener!r}).click()")
             assert (await page.js(UNREADABLE))[1] == []
