@@ -4,7 +4,7 @@ import { STATES } from "./colours.js";
 import { clock, element } from "./panel.js";
 import { COLUMNS } from "./world.js";
 
-const SPAN_S = 600, STEPS = [5, 10, 30, 60, 120, 300], TICK_PX = 52, AXIS = 16, HEAD = 6, GUTTER = 42, NEAR_S = 2;
+const SPAN_S = 600, LEAST_S = 30, STEPS = [5, 10, 30, 60, 120, 300], TICK_PX = 52, AXIS = 16, HEAD = 6, GUTTER = 42, NEAR_S = 2;
 const PLOTS = [
   { title: "", lines: [["sigma", "good", 100, "position σ"], ["bound", "accent", 100, "protection level"]], unit: "cm", least: 5 },
   { title: "cycle time", lines: [["cycle", "accent", 0.001, ""]], unit: "ms", least: 2 },
@@ -62,7 +62,9 @@ export class Plots {
   // Begin and end of the time axis; null: no values.
   span() {
     const rows = this.world.rows, last = rows[rows.length - 1];
-    return last ? [Math.max(last[0] - SPAN_S, Math.min(rows[0][0], last[0] - 30)), last[0]] : null;
+    if (!last) return null;
+    if (this.first !== null) return [Math.max(last[0] - SPAN_S, this.first), Math.max(last[0], this.first + LEAST_S)];
+    return [Math.max(last[0] - SPAN_S, Math.min(rows[0][0], last[0] - LEAST_S)), last[0]];
   }
 
   // The row next to the pointer, else the latest; null: none is near.

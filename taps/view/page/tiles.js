@@ -1,6 +1,7 @@
 // The map: tiles of log-odds as small images in the colours of the theme.
 
 const SEEN = 12, CLEAR = 8;   // log-odds, in units of the stream's 0.1, at which a cell has its full colour
+const FAINTEST = 0.92;        // share of the colour of a cell that is hardly free: it differs from an unknown one
 
 export const CAN_INFLATE = "DecompressionStream" in globalThis;   // Chrome 80, Firefox 113, Safari 16.4
 
@@ -79,7 +80,7 @@ function shadesOf({ wall, free }) {
   const shades = new Uint32Array(256);
   for (let value = -128; value < 128; value++) {
     const [r, g, b] = value > 0 ? wall : free;
-    const alpha = value > 0 ? Math.min(1, value / SEEN) : Math.min(1, -value / CLEAR);
+    const alpha = value > 0 ? Math.min(1, value / SEEN) : value < 0 ? Math.min(1, FAINTEST - value / CLEAR * (1 - FAINTEST)) : 0;
     shades[value + 128] = ((Math.round(255 * alpha) << 24) | (b << 16) | (g << 8) | r) >>> 0;
   }
   return shades;

@@ -64,6 +64,9 @@ def test_what_is_read_and_drawn_stands_out(theme: str) -> None:
     assert low == []
     assert contrast(c["go-ink"], c["accent"]) >= LEAST_TEXT
     assert contrast(c["free"], c["bg"]) >= LEAST_FREE
+    faintest = re.search(r"FAINTEST = ([0-9.]+);", FOLDER.joinpath("tiles.js").read_text())
+    assert faintest is not None
+    assert contrast(mixed(c["free"], c["bg"], float(faintest[1])), c["bg"]) >= LEAST_FREE
     for ground in ("free", "bg"):  # a lamp is seen by its disc or by the edge of it
         assert max(contrast(c[name], c[ground]) for name in ("lamp", "lamp-edge")) >= LEAST_DRAWN
 
