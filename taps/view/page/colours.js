@@ -1,4 +1,4 @@
-// Which colour stands for what, and the legend of the map. The colours themselves are in colours.css.
+// Which colour stands for what, and the legend of the map. The colours themselves are in style.css.
 
 import { element } from "./panel.js";
 

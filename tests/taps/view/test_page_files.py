@@ -25,8 +25,8 @@ Colour = tuple[float, ...]
 def themes() -> dict[str, dict[str, Colour]]:
     """The opaque colours of each theme by name."""
     found = {}
-    text = FOLDER.joinpath("colours.css").read_text()
-    for name, body in zip(("dark", "light"), re.findall(r"\{([^}]*)\}", text), strict=True):
+    blocks = re.findall(r"^:root[^{]*\{([^}]*)\}", FOLDER.joinpath("style.css").read_text(), re.MULTILINE)
+    for name, body in zip(("dark", "light"), blocks, strict=True):
         pairs = re.findall(r"--([a-z-]+): #([0-9a-f]{6});", body)
         found[name] = {key: tuple(int(value[k : k + 2], 16) / 255.0 for k in (0, 2, 4)) for key, value in pairs}
     return found
@@ -73,7 +73,7 @@ def test_what_is_read_and_drawn_stands_out(theme: str) -> None:
 
 def test_all_colours_are_those_of_the_themes() -> None:
     style = FOLDER.joinpath("style.css").read_text()
-    assert not re.findall(r"(?<!-)color:(?! *(?:var|inherit|color-mix))[^;]+;", style)
+    assert not re.findall(r"(?<![-\w])color:(?! *(?:var|inherit|color-mix))[^;]+;", style)
     share = re.search(r"\.chip \{[^}]*background: color-mix\(in srgb, var\(--c\) (\d+)%", style)
     assert share is not None
     assert float(share[1]) == 100.0 * CHIP
