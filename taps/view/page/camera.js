@@ -10,6 +10,7 @@ export class Camera {
     this.scale = 48;         // pixels a metre
     this.follow = true;
     this.fitted = false;     // the user has not chosen a view yet
+    this.shown = "";         // what the view was last fitted to
     this.width = this.height = 1;
     this.covered = 0;        // pixels on the right that the legend covers
     this.fingers = new Map();
@@ -36,17 +37,19 @@ export class Camera {
     this.x += x - nx;
     this.y += y - ny;
     this.fitted = true;
+    this.shown = "";
     this.changed();
   }
 
   fit(box) {
     if (!box) return;
-    const [x0, y0, x1, y1] = box;
+    const [x0, y0, x1, y1] = box, key = [...box, this.width, this.height, this.covered].join();
     this.x = (x0 + x1) / 2;
     this.y = (y0 + y1) / 2;
     this.scale = Math.min(160, Math.max(FARTHEST, Math.min((this.width - this.covered) / (x1 - x0 + 1), (this.height - 60) / (y1 - y0 + 1))));
     this.x += this.covered / 2 / this.scale;
-    this.changed();
+    if (key !== this.shown) this.changed();   // else every drawing would ask for the next one
+    this.shown = key;
   }
 
   // Move the map by pixels.
@@ -54,6 +57,7 @@ export class Camera {
     this.x -= right / this.scale;
     this.y += down / this.scale;
     this.fitted = true;
+    this.shown = "";
     this.setFollow(false);
     this.changed();
   }

@@ -21,6 +21,7 @@ export class World {
     this.rows = [];
     this.faults = [];
     this.margin = MARGIN_M[0];
+    this.box = null;         // of where the robot has been: x0, y0, x1, y1, m
     this.lampsPlaced = false;
     this.chosen = null;      // number of the lamp whose details are shown
     this.dirty = true;
@@ -61,6 +62,7 @@ export class World {
 
   on_loop(data, since = performance.now()) {
     this.loops.push({ ...data, since });
+    for (const at of [data.at_new, data.at_old]) if (at) this.include(at);
     if (this.loops.length > LOOPS) this.loops.shift();
   }
 
@@ -82,12 +84,20 @@ export class World {
 
   walk(pose, state, jumps, map) {
     const last = this.trail[this.trail.length - 1];
+    if (last && last.map !== map) this.box = null;
+    this.include(pose);
     const way = last ? Math.hypot(pose[0] - last.x, pose[1] - last.y) : Infinity;
     if (last && way < STEP_M && last.state === state) return;
     if (last && last.map !== map) this.trail = [];
     const torn = !last || way > LEAP_M || (last.jumps !== jumps && way > 0.1);
     this.trail.push({ x: pose[0], y: pose[1], state, jumps, map, torn });
     if (this.trail.length > TRAIL) this.trail.splice(0, TRAIL / 8);
+  }
+
+  // The robot has been there.
+  include([x, y]) {
+    const box = this.box || [x, y, x, y];
+    this.box = [Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x), Math.max(box[3], y)];
   }
 
   // The interpolated pose at a time; null: no poses.
@@ -106,13 +116,9 @@ export class World {
   // Bounding box (x0, y0, x1, y1) of where the robot has been, m, with the room about it; null: not known.
   // The margin is the largest median range of a scan: beams through glass or a door are too few to change it.
   been() {
-    const places = this.trail.map(({ x, y }) => [x, y]);
-    for (const { at_new: a, at_old: b } of this.loops) for (const at of [a, b]) if (at) places.push(at);
-    if (this.pose && this.pose.pose) places.push(this.pose.pose);
-    if (!places.length) return null;
-    const { margin } = this;
-    const xs = places.map(([x]) => x), ys = places.map(([, y]) => y);
-    return [Math.min(...xs) - margin, Math.min(...ys) - margin, Math.max(...xs) + margin, Math.max(...ys) + margin];
+    if (!this.box) return null;
+    const [x0, y0, x1, y1] = this.box, { margin } = this;
+    return [x0 - margin, y0 - margin, x1 + margin, y1 + margin];
   }
 
   // The latest scan as points of the map, x and y alternating; null: no scan or no pose.

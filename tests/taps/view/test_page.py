@@ -312,3 +312,19 @@ def test_picture_and_values_are_saved(browser: str, tmp_path: Path) -> None:
         assert "TRACKING" in (await arrived("*-events.csv")).read_text()
 
     look(browser, tmp_path, body)
+
+
+def test_a_page_of_a_robot_that_stands_rests(browser: str, tmp_path: Path) -> None:
+    """Without new data there is nothing to draw, but for the clock's sake once a second."""
+
+    async def body(page: Tab) -> None:
+        await page.js("lumiloop.link.take = () => {}")
+        await asyncio.sleep(1.0)
+        await page.js(
+            "globalThis.drawn = 0; const above = lumiloop.painter.above;"
+            "lumiloop.painter.above = (...now) => { drawn += 1; return above.apply(lumiloop.painter, now); }; 0"
+        )
+        await asyncio.sleep(2.0)
+        assert 1 <= await page.js("drawn") <= 8
+
+    look(browser, tmp_path, body)
