@@ -43,7 +43,9 @@ class Screen:
             self._first = min(self._first, len(lines) - room + 1)
             shown = lines[self._first : self._first + room - 1]
             last = self._first + len(shown)
-            shown.append(f"-- lines {self._first + 1} to {last} of {len(lines)}; keys: j k space b, q quits"[:columns])
+            shown.append(
+                f"-- lines {self._first + 1} to {last} of {len(lines)}; scroll: arrows, space, b; quit: q"[:columns]
+            )
         else:
             self._first, shown = 0, lines
         sys.stdout.write(CLEAR + "\n".join(shown))
