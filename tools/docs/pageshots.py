@@ -22,7 +22,7 @@ PICTURES: Final = ("view.png", "view-phone.png")
 DESKTOP, PHONE = (1280, 860), (390, 844)
 WELL: Final = 'lumiloop.world.pose.state_name === "TRACKING" && lumiloop.world.faults.length === 0'
 """A picture of a robot on a computer that was too slow just then shows nobody what to expect."""
-PATIENCE_S: Final = 600.0
+PATIENCE_S: Final = 180.0
 SETTLE_S: Final = 3.0
 
 
@@ -37,7 +37,7 @@ async def photograph(browser: str, address: str, out: Path, seconds: float) -> N
     """Both pictures, after so many seconds of driving, of a robot that is TRACKING without a fault.
 
     Raises:
-        BrowserError: it is not, for ten minutes.
+        BrowserError: it is not, for three minutes.
     """
     async with tab(browser, address, DESKTOP) as page:
         await page.until(SEEN, 60.0)

@@ -123,7 +123,7 @@ export class Plots {
     for (const [name, colour, factor] of plot.lines) curve(context, rows, COLUMNS[name], (t, v) => [x(t), y(Math.min(top, v * factor))], begin, colours[colour]);
     context.fillStyle = colours.dim;
     context.textAlign = "right";
-    for (const value of [top, top / 2]) context.fillText(`${value % 1 ? value.toFixed(1) : value}${unit}`, GUTTER - 5, y(value) + 4);
+    for (const value of plot.unit || top % 2 === 0 ? [top, top / 2] : [top]) context.fillText(`${value % 1 ? value.toFixed(1) : value}${unit}`, GUTTER - 5, y(value) + 4);
     if (this.cursor !== null) this.mark(context, x(this.cursor), foot, width, colours);
   }
 
