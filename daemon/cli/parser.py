@@ -198,7 +198,7 @@ def _why(parser: argparse.ArgumentParser) -> None:
 def _status(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("address", nargs="?", metavar="HOST[:PORT]", help="default: the configuration's Modbus server")
     parser.add_argument("--json", action="store_true", help="machine-readable output")
-    parser.add_argument("--watch", action="store_true", help="keep showing until interrupted")
+    parser.add_argument("--watch", action="store_true", help="keep showing; arrows, space and b scroll, q quits")
     config_arguments(parser)
     parser.set_defaults(body=later("daemon.cli.status", "main"))
 

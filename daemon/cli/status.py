@@ -6,7 +6,7 @@ Standard library only, so that it starts at once on any computer.
 from __future__ import annotations
 
 import argparse
-import shutil
+import contextlib
 import sys
 import time
 from typing import TYPE_CHECKING, Final
@@ -17,6 +17,7 @@ from daemon.cli.status_table import as_table
 from daemon.publish.modbus.client import NoAnswer, Reader, Reading
 from daemon.publish.modbus.points import Value
 from daemon.publish.port_owner import Whose
+from daemon.system.terminal_screen import Screen, key, keyboard
 
 if TYPE_CHECKING:
     from daemon.config.schema import Config
@@ -27,7 +28,7 @@ DEFAULT_PORT: Final = 1502
 _STALL_S: Final = 0.4  # the slowest lidar makes a snapshot every 0.15 s
 _REFRESH_S: Final = 0.5
 _ANY_HOST: Final = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}
-_CLEAR: Final = "\x1b[H\x1b[2J"
+_INDENT: Final = 11  # of a wrapped line: below the text, not below the label
 
 
 def main(args: argparse.Namespace) -> int:
@@ -72,6 +73,12 @@ def _once(reader: Reader, as_json: bool) -> int:
 
 
 def _watch(reader: Reader, as_json: bool) -> int:
+    screen = Screen(_INDENT) if sys.stdout.isatty() and not as_json else None
+    with keyboard() if screen is not None else contextlib.nullcontext(False) as keys:
+        return _watch_on(reader, as_json, screen, keys)
+
+
+def _watch_on(reader: Reader, as_json: bool, screen: Screen | None, keys: bool) -> int:
     before: Value = None
     who, told = None, ""
     while True:
@@ -79,30 +86,42 @@ def _watch(reader: Reader, as_json: bool) -> int:
             reading = reader.read()
             who = reader.whose() if before is None or who is None else who
         except NoAnswer as error:
-            if str(error) != told:
+            if screen is not None:
+                screen.show(f"{error}; waiting")
+            elif str(error) != told:
                 sys.stderr.write(f"lumiloop: {error}; waiting\n")
             before, told = None, str(error)
         else:
             told = ""
-            on_screen = sys.stdout.isatty() and not as_json
-            _show(reading, as_json, reading["seq"] == before, who, on_screen)
+            _show(reading, as_json, reading["seq"] == before, who, screen)
             before = reading["seq"]
-        time.sleep(_REFRESH_S)
+        if screen is None or not keys:
+            time.sleep(_REFRESH_S)
+        elif not _scroll(screen):
+            return OK
 
 
-def _show(reading: Reading, as_json: bool, stalled: bool, who: Whose, on_screen: bool = False) -> None:
+def _scroll(screen: Screen) -> bool:
+    """Scroll by the keys that are pressed until the next look; returns whether to go on."""
+    end = time.monotonic() + _REFRESH_S
+    while (left := end - time.monotonic()) > 0.0:
+        action = key(left)
+        if action == "quit":
+            sys.stdout.write("\n")
+            return False
+        if action:
+            screen.scroll(action)
+    return True
+
+
+def _show(reading: Reading, as_json: bool, stalled: bool, who: Whose, screen: Screen | None = None) -> None:
     if as_json:
         print_report("status", as_object(reading, stalled, who.pid))
         return
-    text = (f"{'daemon':<10} {who}\n" if who.pid else "") + as_table(reading, stalled)
-    sys.stdout.write((_CLEAR + _fitted(text) if on_screen else text) + "\n")
+    table, owner = as_table(reading, stalled), f"{'daemon':<10} {who}" if who.pid else ""
+    text = "\n".join(filter(None, [owner, table] if screen is None else [table, owner]))  # on a screen: state first
+    if screen is not None:
+        screen.show(text)
+        return
+    sys.stdout.write(text + "\n")
     sys.stdout.flush()
-
-
-def _fitted(text: str) -> str:
-    """Returns the lines that fit into the terminal: the state, which comes first, must not scroll away."""
-    size = shutil.get_terminal_size()
-    lines, room = [line[: size.columns] for line in text.splitlines()], max(2, size.lines - 1)
-    if len(lines) > room:
-        lines[room - 1 :] = [f"... {len(lines) - room + 1} more lines: a higher window"[: size.columns]]
-    return "\n".join(lines)

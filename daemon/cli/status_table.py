@@ -31,24 +31,24 @@ def _links(reading: Reading) -> Iterator[dict[str, Any]]:
 
 
 def as_table(reading: Reading, stalled: bool) -> str:
-    """Returns the reading as a table: one line a subject."""
+    """Returns the reading as a table: state, pose, faults and lamps first; one line a subject."""
     flags = registers.decode_bits(registers.FLAGS, reading["flags"])
     starting = reading["state"] == State.STARTING  # no cycle yet: there are no new snapshots, and devices have no state
     still = "  (STANDS STILL: no new snapshot)" if stalled and not starting else ""
     rows = [
         ("state", _state(reading["state"]) + still),
         ("reason", _meaning("reason", reading["reason"])),
-        ("fault", _meaning("fault", reading["fault"])),
-        *_more_faults(reading),
         ("map pose", _pose(reading, "map") + _reserve(reading["state"], flags)),
         ("sigma", _triple(reading, ("sigma_x", "sigma_y", "sigma_yaw"), "m", "")),
         *_trust(reading),
+        ("fault", _meaning("fault", reading["fault"])),
+        *_more_faults(reading),
+        *_lights(reading),
         ("odom pose", _pose(reading, "odom")),
         ("speed", _triple(reading, ("v_x", "v_y", "yaw_rate"), "m/s", "/s")),
         ("age", _bounded(reading["age"], "s")),
         ("map", f"id {reading['map_id']:08x}, {reading['jumps']} jumps"),
         ("loops", _loops(reading)),
-        *_lights(reading),
         ("scans", f"{_number(reading['scan_rate'], 'Hz', 2)}, {reading['missed']} missed"),
         ("cycle", f"{_number(reading['cycle'], 's', 5)}, {reading['overruns']} over budget{_left_out(reading)}"),
         ("devices", _devices(reading["devices"], starting)),

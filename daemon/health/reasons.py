@@ -35,59 +35,65 @@ class Reason(IntEnum):
 
 REASONS: Final[dict[Reason, tuple[str, str]]] = {
     Reason.NONE: ("the pose is confirmed", ""),
-    Reason.WARMING_UP: ("starting up", "wait; the first start of a version compiles for a minute or two"),
+    Reason.WARMING_UP: ("starting", "wait; the first start of a version compiles for a minute or two"),
     Reason.OPENING_LIDAR: ("the lidar is being opened", "wait a few seconds"),
     Reason.LIDAR_UNREACHABLE: ("the lidar cannot be opened", "read the log, then run `lumiloop probe`"),
     Reason.LIDAR_SILENT: (
-        "no valid scan for three scan periods, or not steadily again",
+        "no valid scan for three scan periods, or scans do not arrive steadily yet",
         "check the lidar's power and cable",
     ),
-    Reason.UNPROVED: ("the pose follows the laser, nothing has confirmed it yet", "wait, or drive a metre or two"),
-    Reason.AXIS_UNKNOWN: ("the surroundings do not fix every axis of the pose", "read the known-axis bits"),
-    Reason.MATCH_FAILED: ("scans do not fit the map, the pose is held", "is the lidar covered, lifted or crowded in?"),
+    Reason.UNPROVED: ("the pose follows the lidar; it is not confirmed yet", "wait, or drive a metre or two"),
+    Reason.AXIS_UNKNOWN: ("the surroundings do not determine every axis of the pose", "read the known-axis bits"),
+    Reason.MATCH_FAILED: (
+        "scans do not match the map; the pose is extrapolated",
+        "check whether the lidar is covered, lifted or surrounded by people",
+    ),
     Reason.WITNESSES_DISAGREE: (
-        "odometry and laser disagree about the motion",
-        "wheel slip; if it lasts, check odometry scale and lidar mount",
+        "odometry and lidar disagree about the motion",
+        "check for wheel slip; if it persists, check odometry scale and lidar mount",
     ),
-    Reason.ODOMETRY_SILENT: ("odometry is configured and does not arrive", "check its sender and `odometry.port`"),
+    Reason.ODOMETRY_SILENT: ("odometry is configured, but does not arrive", "check its sender and `odometry.port`"),
     Reason.UNCERTAIN: (
-        "the robot may have moved further than anything has witnessed",
-        "set the pose, or drive to where it was known; wheel odometry bridges such gaps",
+        "the robot may have moved further than any sensor has measured",
+        "set the pose, or drive back to where it was known; wheel odometry bridges such gaps",
     ),
-    Reason.NO_WITNESS: ("nothing has confirmed the pose for too long", "set the pose, or drive to where it was known"),
-    Reason.SEVERAL_PLACES: ("several places fit", "drive on until one is left"),
-    Reason.SEARCHING: ("looking for the place in the map", "wait; where it lasts, drive a metre or two"),
+    Reason.NO_WITNESS: (
+        "nothing has confirmed the pose for too long",
+        "set the pose, or drive back to where it was known",
+    ),
+    Reason.SEVERAL_PLACES: ("several poses are possible", "drive on until only one remains"),
+    Reason.SEARCHING: ("searching for the pose in the map", "wait; if it persists, drive a metre or two"),
     Reason.CONFIRMING: (
-        "scans fit again, or light and pose draw together; being confirmed",
-        "wait a few seconds; where it lasts, drive a metre or two",
+        "position found again; waiting for confirmation",
+        "wait a few seconds; if it persists, drive a metre or two",
     ),
     Reason.LIGHT_SILENT: (
-        "the photodiode is configured and its samples do not arrive",
-        "check its converter's power and bus; read the fault",
+        "the photodiode is configured, but its samples do not arrive",
+        "check the converter's power and bus; read the fault",
     ),
     Reason.LIGHT_DARK: (
-        "the lamps have not told the place for a while: too few are received, or they do not agree on one",
-        "are the lamps on, is the photodiode covered, is this part of the building surveyed? else drive a metre or two",
+        "light has not determined the position for a while: too few lamps are received, or they disagree",
+        "check that the lamps are on, the photodiode is free and this area is surveyed; then drive a metre or two",
     ),
     Reason.LIGHT_DISAGREES: (
-        "light and pose contradict each other about the place",
-        "wait some seconds; if it lasts or comes again: lamps moved, a wrong survey, or the laser slipped",
+        "light and pose disagree about the position",
+        "wait some seconds; if it persists or returns, check for moved lamps, a wrong survey, or a wrong scan match",
     ),
     Reason.LIGHT_LOST: (
-        "what is received does not fit the place, it is being found anew from the lamps",
-        "drive a metre or two; if it lasts, check the survey",
+        "the received light does not fit the position; the light filter restarts",
+        "drive a metre or two; if it persists, check the survey",
     ),
     Reason.UNPLACED: (
-        "where the robot stands and looks in the survey is not known yet",
+        "the pose in the survey is not known yet",
         "drive a metre or two in view of three lamps, or set the pose",
     ),
     Reason.PAUSED: (
-        "paused by command: the laser does not move the pose and the map is not touched",
+        "paused by command: no mapping, and no correction of the pose by the lidar",
         "give the command RESUME",
     ),
     Reason.OVERLOADED: (
-        "the computer is too slow: the laser is left out, light and odometry carry the pose",
-        "take load off the computer, or raise `cycle.budget_ms`",
+        "the computer is too slow: the lidar is left out, the pose continues by light and odometry",
+        "reduce the load of the computer, or raise `cycle.budget_ms`",
     ),
 }
 """Meaning and remedy of every reason."""

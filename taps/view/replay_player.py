@@ -9,7 +9,7 @@ from typing import Any, Final, TypeGuard
 import msgspec
 
 from taps.view.replay_file import ReplayFile
-from taps.view.viewers import LOOPS, ROWS, Tile, Viewer, frame
+from taps.view.viewers import LOOPS, PAST_FAULTS, ROWS, Tile, Viewer, frame
 
 TICK_S: Final = 0.04
 LOOK_S: Final = 0.2
@@ -87,6 +87,8 @@ class ReplayPlayer:
         viewer.put("row", _join(self._past("row", ROWS)), once=True)
         if loops := self._past("loop", LOOPS):  # as history, not as new events
             viewer.put("loops", frame("loops", [_piece(loop).data for loop in loops]), once=True)
+        if faults := self._past("faults", PAST_FAULTS):
+            viewer.put("past", frame("past", [_piece(fault).data for fault in faults]), once=True)
         self._latest(-math.inf)
         self._tiles()
 

@@ -207,7 +207,7 @@ class View:
         try:
             if not viewer.order:
                 raise CommandRefused(
-                    "this page may only look: start `lumiloop view --write` and use the address it says"
+                    "this page is read-only: start `lumiloop view --write` and open the address that it prints"
                 )
             await self._orders.give(viewer.number, message)
         except CommandRefused as error:
@@ -239,7 +239,7 @@ class View:
                 self.hub.disconnected(str(error))
                 log.error("%s", error)
             except Exception:  # an internal error: the page shows it and continues
-                self.hub.disconnected("what the daemon told could not be shown; the log of `lumiloop view` says why")
+                self.hub.disconnected("an internal error of the page's server; see the log of `lumiloop view`")
                 log.exception("what the daemon told could not be shown")
             await asyncio.sleep(TRY_AGAIN_S)
 

@@ -12,12 +12,14 @@ from typing import Any, ClassVar, Final
 
 import msgspec
 
-from daemon.publish.stream.messages import TYPES, Data, Lights, MapTiles, Pose
+from daemon.publish.stream.messages import TYPES, Data, Faults, Lights, MapTiles, Pose
 
 KEPT: Final = 64
 """Most queued events."""
 LOOPS: Final = 32
 """Loop closures sent to a new viewer."""
+PAST_FAULTS: Final = 64
+"""Changes of the present faults sent to a new viewer."""
 TILES_BYTES: Final = 64 << 10
 """Bytes of tiles in one message, about."""
 ROWS: Final = 1200
@@ -139,6 +141,7 @@ class Hub:
         self.history = History()
         self._latest: dict[str, bytes] = {}
         self._loops: deque[Data] = deque(maxlen=LOOPS)
+        self._faults: deque[Faults] = deque(maxlen=PAST_FAULTS)
         self._tiles: dict[Tile, bytes] = {}
         self._about: dict[str, object] = {}
         self._used: int | None = None
@@ -150,6 +153,7 @@ class Hub:
         self.history = History()
         self._latest, self._tiles = {}, {}
         self._loops.clear()
+        self._faults.clear()
         for viewer in self.viewers:
             viewer.clear()
         self._broadcast_daemon()
@@ -171,6 +175,8 @@ class Hub:
             self._loops.append(data)
         elif not once:
             self._latest[topic] = body
+        if isinstance(data, Faults):
+            self._faults.append(data)
         for viewer in self.viewers:
             viewer.put(topic, body, once)
         if isinstance(data, Lights):
@@ -191,6 +197,8 @@ class Hub:
         viewer.put("history", frame("history", list(self.history.rows)), once=True)
         if self._loops:  # as history, not as new events
             viewer.put("loops", frame("loops", list(self._loops)), once=True)
+        if self._faults:
+            viewer.put("past", frame("past", list(self._faults)), once=True)
         for topic, body in self._latest.items():
             viewer.put(topic, body)
         viewer.put_tiles(self._about, self._tiles.items())

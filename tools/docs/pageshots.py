@@ -20,24 +20,24 @@ from tools.docs.browser import BrowserError, chromium, robot, tab, view
 SEEN: Final = "globalThis.lumiloop && lumiloop.world.pose && lumiloop.world.pose.pose && lumiloop.world.lampsPlaced"
 PICTURES: Final = ("view.png", "view-phone.png")
 DESKTOP, PHONE = (1280, 860), (390, 844)
-WELL: Final = 'lumiloop.world.pose.state_name === "TRACKING"'
+WELL: Final = 'lumiloop.world.pose.state_name === "TRACKING" && lumiloop.world.faults.length === 0'
 """A picture of a robot on a computer that was too slow just then shows nobody what to expect."""
-PATIENCE_S: Final = 120.0
+PATIENCE_S: Final = 180.0
 SETTLE_S: Final = 3.0
 
 
 def smaller(path: Path) -> None:
     """The PNG at ``path`` with 256 colours, a third of its size; a page is flat, nobody sees the difference."""
     with Image.open(path) as image:
-        few = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+        few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     few.save(path, optimize=True)
 
 
 async def photograph(browser: str, address: str, out: Path, seconds: float) -> None:
-    """Both pictures, after so many seconds of driving, of a robot that is TRACKING.
+    """Both pictures, after so many seconds of driving, of a robot that is TRACKING without a fault.
 
     Raises:
-        BrowserError: it is not, for two minutes.
+        BrowserError: it is not, for three minutes.
     """
     async with tab(browser, address, DESKTOP) as page:
         await page.until(SEEN, 60.0)

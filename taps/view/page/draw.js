@@ -1,8 +1,8 @@
-// Draws the map and, above it, robot, scan, lamps and loops.
+// Draws the map and, above it, robot, scan, lamps and loop closures.
+
+import { colours, rgb, STATES, USES } from "./colours.js";
 
 const FULL_TURN = 2 * Math.PI, ELLIPSE = 2.448, PULSE_MS = 2500;   // 2.448 deviations hold 95 % in a plane
-const STATES = ["none", "bad", "teal", "good", "warn", "seek", "bad", "seek"];
-const USES = { ACCEPTED: "good", OCCLUDED: "warn", MISSING: "warn", REJECTED: "bad", TWIN: "bad", UNSURVEYED: "bad" };
 
 export class Painter {
   constructor(base, over, world, camera) {
@@ -15,11 +15,8 @@ export class Painter {
   }
 
   recolour() {
-    const style = getComputedStyle(document.documentElement), name = (key) => style.getPropertyValue(`--${key}`).trim();
-    this.c = {};
-    for (const key of ["bg", "ink", "dim", "faint", "accent", "good", "teal", "warn", "seek", "bad", "lamp", "grid", "scan", "card"]) this.c[key] = name(key);
-    this.c.none = this.c.faint;
-    this.shades = { wall: rgb(name("wall")), free: rgb(name("free")) };
+    this.c = colours();
+    this.shades = { wall: rgb(this.c.wall), free: rgb(this.c.free) };
     this.world.tiles.repaint();
   }
 
@@ -63,7 +60,8 @@ export class Painter {
     if (layers.links) this.lights(context, pose);
     if (layers.scan) this.scan(context);
     if (pose) this.robot(context, pose);
-    if (this.camera.aim) this.arrow(context, this.camera.aim);
+    if (this.camera.aim && this.camera.mode === "pose") this.arrow(context, this.camera.aim);
+    if (this.camera.aim && this.camera.mode === "ruler") this.ruler(context, this.camera.aim);
     return moving;
   }
 
@@ -80,10 +78,8 @@ export class Painter {
         if (trail[i].torn) context.moveTo(...at); else context.lineTo(...at);
       }
       context.strokeStyle = this.c[STATES[state] || "none"];
-      context.globalAlpha = 0.55;
       context.stroke();
     }
-    context.globalAlpha = 1;
   }
 
   loops(context, now) {
@@ -94,7 +90,7 @@ export class Painter {
       const fresh = Math.max(0, 1 - (now - loop.since) / PULSE_MS);
       moving = moving || fresh > 0;
       context.strokeStyle = context.fillStyle = this.c.seek;
-      context.globalAlpha = 0.35 + 0.65 * fresh;
+      context.globalAlpha = 0.7 + 0.3 * fresh;
       context.lineWidth = 1.5 + 3 * fresh;
       context.beginPath();
       line(context, a, b);
@@ -123,18 +119,28 @@ export class Painter {
       const colour = link ? this.c[USES[world.useName(link.use)] || "faint"] : this.c.lamp;
       if (link && pose) {
         context.strokeStyle = colour;
-        context.globalAlpha = 0.25 + 0.6 * Math.sqrt(link.strength / strongest);
-        context.lineWidth = 1 + 2.5 * Math.sqrt(link.strength / strongest);
+        context.globalAlpha = 0.85;
+        context.lineWidth = 1 + 3 * Math.sqrt(link.strength / strongest);
         context.setLineDash(world.useName(link.use) === "ACCEPTED" ? [] : [5, 5]);
         context.beginPath();
         line(context, at, camera.screen(pose[0], pose[1]));
         context.stroke();
         context.setLineDash([]);
       }
-      context.globalAlpha = link ? 1 : 0.55;
+      context.globalAlpha = 1;
       context.fillStyle = this.c.lamp;
+      context.strokeStyle = this.c["lamp-edge"];
+      context.lineWidth = 1.5;
       const size = Math.max(4, Math.min(9, camera.scale * 0.1));
       disc(context, at, size);
+      context.stroke();
+      if (lamp === world.chosen) {
+        context.strokeStyle = this.c.ink;
+        context.lineWidth = 2;
+        context.beginPath();
+        context.arc(...at, size + 8, 0, FULL_TURN);
+        context.stroke();
+      }
       if (link) {
         context.strokeStyle = colour;
         context.lineWidth = 2;
@@ -143,7 +149,6 @@ export class Painter {
         context.stroke();
       }
       if (camera.scale > 14 || link) this.label(context, String(lamp), at[0], at[1] - size - 7);
-      context.globalAlpha = 1;
     }
   }
 
@@ -211,6 +216,22 @@ export class Painter {
     context.globalAlpha = 1;
   }
 
+  ruler(context, { from, to }) {
+    const a = this.camera.screen(...from), b = this.camera.screen(...to);
+    context.strokeStyle = context.fillStyle = this.c.accent;
+    context.lineWidth = 2;
+    context.beginPath();
+    line(context, a, b);
+    context.stroke();
+    for (const at of [a, b]) disc(context, at, 4);
+    const [dx, dy] = [to[0] - from[0], to[1] - from[1]], turn = 180 / Math.PI * Math.atan2(dy, dx);
+    context.font = "600 13px system-ui, sans-serif";
+    context.textAlign = "center";
+    this.label(context, `${Math.hypot(dx, dy).toFixed(2)} m`, (a[0] + b[0]) / 2, (a[1] + b[1]) / 2 - 10);
+    context.font = "12px system-ui, sans-serif";
+    this.label(context, `Δx ${dx.toFixed(2)}, Δy ${dy.toFixed(2)} m, ${turn.toFixed(0)}°`, (a[0] + b[0]) / 2, (a[1] + b[1]) / 2 + 18);
+  }
+
   arrow(context, { from, to }) {
     const at = this.camera.screen(...from), tip = this.camera.screen(...to);
     context.strokeStyle = context.fillStyle = this.c.accent;
@@ -241,9 +262,4 @@ function disc(context, at, radius) {
   context.beginPath();
   context.arc(at[0], at[1], radius, 0, FULL_TURN);
   context.fill();
-}
-
-function rgb(text) {
-  const n = parseInt(text.slice(1, 7), 16);
-  return [n >> 16, (n >> 8) & 255, n & 255];
 }

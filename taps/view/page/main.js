@@ -1,23 +1,33 @@
 // Connects the parts of the page: messages update the world, and a changed world is drawn.
 
 import { Camera } from "./camera.js";
+import { Cycle } from "./cycle.js";
 import { Painter } from "./draw.js";
+import { Events } from "./events.js";
+import { FaultList } from "./faults.js";
+import { eventsFile, picture, scaleOf, values } from "./files.js";
+import { Lamps } from "./lamps.js";
 import { Link } from "./link.js";
 import { Orders } from "./orders.js";
 import { $, element, Panel, put } from "./panel.js";
 import { Plots } from "./plots.js";
 import { CAN_INFLATE } from "./tiles.js";
 import { TimeBar } from "./timebar.js";
+import { Tools } from "./tools.js";
 import { World } from "./world.js";
 
 const WORDS_MS = 200, PLOTS_MS = 500, SLOW_MS = 400, TOAST_MS = 4000, OLD_MS = 3000, LATE = 200;
-const TOO_OLD = CAN_INFLATE ? "" : "This browser is too old to draw the map; one of 2023 or later does";
+const TOO_OLD = CAN_INFLATE ? "" : "This browser is too old to draw the map. Use one of 2023 or later.";
 
 const world = new World();
 const camera = new Camera($("stage"), () => { baseDirty = true; schedule(); });
 const painter = new Painter($("base"), $("over"), world, camera);
 const panel = new Panel(world);
-const plots = new Plots(world, $("plots"));
+const faults = new FaultList();
+const lamps = new Lamps(world, camera);
+const cycle = new Cycle(world);
+const events = new Events(world);
+const plots = new Plots(world, $("plots"), () => { plotsAt = 0; schedule(); });
 let baseDirty = true, scheduled = false, gone = "", wordsAt = 0, plotsAt = 0, session = 0, recording = null, poseAt = 0, old = false;
 const late = [];          // latest delays from scan to screen, ms
 let unshown = null;       // the pose of the next drawing
@@ -26,9 +36,9 @@ const link = new Link({
   welcome(words) {
     world.scene = { ...world.scene, ...words };
     recording = words.recording;
-    document.title = `${words.name} – lumiloop`;
     put("name", recording || words.name);
     orders.welcome(words);
+    tools.scene();
     $("token").close();
     if (words.wrong_token) toast("That token is not the right one: read-only", "bad");
   },
@@ -37,34 +47,43 @@ const link = new Link({
     else banner(words.what === "version" ? words.text : `${words.text} Trying again.`);
   },
   lost() {
-    gone = barred() ? "not shown without a token" : "the page has lost its server; trying again";
-    if (!link.refused) banner("No connection to this page's server; trying again");
+    if (!gone && poseAt) event("Connection to the page's server lost", "bad");
+    gone = barred() ? "a token is needed" : "no connection to the page's server; trying again";
+    if (!link.refused) banner("No connection to the page's server. Trying again.");
     orders.lost();
     schedule();
   },
   frame,
 });
 const orders = new Orders(link, camera, toast);
+const tools = new Tools(world, camera, lamps);
 const timebar = new TimeBar(link, world);
 
 function frame(topic, data) {
   if (topic === "daemon") daemon(data);
-  else if (topic === "order") orders.take(data);
-  else if (topic === "film") timebar.take(data);
-  else if (topic === "scene") { world.scene = { ...world.scene, ...data }; put("name", recording || data.name); }
+  else if (topic === "order") { orders.take(data); event(`Command ${orders.worded(data)}`, "accent"); }
+  else if (topic === "film") { timebar.take(data); plots.first = events.first = data.t_first; }
+  else if (topic === "scene") { world.scene = { ...world.scene, ...data }; put("name", recording || data.name); tools.scene(); }
+  else if (topic === "past") events.on_past(data);
   else if (world.take(topic, data)) {
+    if (topic === "rewound") events.forget();
+    else if (events[`on_${topic}`]) events[`on_${topic}`](data);
     if (topic === "pose") { unshown = data; gone = ""; poseAt = performance.now(); }
     if (topic === "map") baseDirty = true;
-    if (topic === "loop" && !recording) toast(`Loop closed: ${data.keyframe_new} → ${data.keyframe_old}`, "loop");
+    if (topic === "loop" && !recording) toast(`Loop closure: keyframe ${data.keyframe_new} to ${data.keyframe_old}`, "loop");
   }
   schedule();
 }
 
 function daemon(data) {
-  if (data.session !== session) { world.forget(); session = data.session; camera.fitted = false; }
+  if (data.session !== session) { world.forget(); session = data.session; camera.fitted = false; if (!recording) events.state = events.map = events.jumps = null; }
+  if (!data.up && !gone && poseAt) event(`No daemon: ${data.why}`, "bad");
   gone = data.up ? "" : data.why;
   banner(data.up ? "" : `No daemon: ${data.why}`);
 }
+
+// Something that happens now.
+function event(text, colour) { if (!recording) events.add(events.now(link.now()), text, colour); }
 
 // Refused without a token: no reconnect until there is one.
 function barred() { return link.refused === "token"; }
@@ -107,11 +126,7 @@ function draw(now) {
 }
 
 function fit() {
-  const box = world.tiles.extent(), pose = world.pose && world.pose.pose;
-  if (!box && !pose) return;
-  const around = pose ? [pose[0] - 2, pose[1] - 2, pose[0] + 2, pose[1] + 2] : box;
-  const all = box ? [Math.min(box[0], around[0]), Math.min(box[1], around[1]), Math.max(box[2], around[2]), Math.max(box[3], around[3])] : around;
-  camera.fit(all);
+  camera.fit(world.been());
 }
 
 // Age of the scan on the screen.
@@ -126,7 +141,7 @@ function measure() {
 // A connected daemon without messages; unknown while the server is silent, too.
 function stale() {
   const now = poseAt > 0 && !recording && !gone && performance.now() - poseAt > OLD_MS;
-  const who = link.heard - poseAt > OLD_MS ? ": the daemon stands" : "";
+  const who = link.heard - poseAt > OLD_MS ? ": the daemon does not respond" : "";
   if (now) banner(`No new pose for ${Math.round((performance.now() - poseAt) / 1000)} s${who}`);
   else if (old && !gone) banner("");
   old = now;
@@ -134,25 +149,32 @@ function stale() {
 
 function words() {
   stale();
-  panel.state(gone, barred() ? "NO TOKEN" : link.socket ? "NO DAEMON" : "NO SERVER");
+  const state = panel.state(gone, barred() ? "NO TOKEN" : link.socket ? "NO DAEMON" : "NO SERVER");
+  const title = `${state} – ${$("name").textContent} – lumiloop`;
+  if (document.title !== title) document.title = title;
+  faults.show(gone ? [] : world.faults);
   panel.pose();
-  panel.lights();
-  panel.cycle();
-  panel.loops();
+  lamps.table();
+  cycle.show();
+  events.show();
   const usual = [...late].sort((a, b) => a - b)[late.length >> 1];
-  put("late", recording ? "recording" : usual === undefined || gone ? "– ms" : `${Math.round(usual)} ms`);
-  $("late").classList.toggle("slow", usual > SLOW_MS);
+  $("late-tag").hidden = Boolean(recording);
+  put("late", usual === undefined || gone ? "– ms" : `${Math.round(usual)} ms`);
+  $("late-tag").classList.toggle("slow", usual > SLOW_MS);
 }
 
 function scale() {
-  const m = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50].find((value) => value * camera.scale >= 60) || 100;
-  $("scale-bar").style.width = `${m * camera.scale}px`;
-  put("scale-text", `${m} m`);
+  const { metres, pixels } = scaleOf(camera);
+  $("scale-bar").style.width = `${pixels}px`;
+  put("scale-text", `${metres} m`);
 }
+
+// A file's name, of this robot and this time.
+function fileName() { return `lumiloop-${$("name").textContent}-${new Date().toISOString().slice(0, 19).replaceAll(":", "")}`; }
 
 function theme(name) {
   document.documentElement.dataset.theme = name;
-  document.querySelector("meta[name=theme-color]").content = name === "light" ? "#f3f5f9" : "#0d1117";
+  document.querySelector("meta[name=theme-color]").content = name === "light" ? "#f3f5f9" : "#141a23";
   painter.recolour();
   baseDirty = true;
   plotsAt = 0;
@@ -170,22 +192,22 @@ $("zoom-in").addEventListener("click", () => camera.zoom(1.4));
 $("zoom-out").addEventListener("click", () => camera.zoom(1 / 1.4));
 $("fit").addEventListener("click", () => { camera.fitted = false; schedule(); });
 $("follow").addEventListener("click", () => camera.setFollow(!camera.follow));
+$("shot").addEventListener("click", () => picture($("stage"), camera, painter.c, painter.ratio, `${$("name").textContent}   ${$("state-name").textContent}   x ${$("x").textContent}, y ${$("y").textContent} m, ${$("yaw").textContent}   ${new Date().toISOString().slice(0, 19)}Z`, fileName()));
+$("csv").addEventListener("click", () => values(world, fileName()));
+$("events-csv").addEventListener("click", () => eventsFile(events, fileName()));
+$("card-cycle").addEventListener("toggle", () => cycle.show());
+camera.onmode = (mode) => { orders.mode(mode); tools.mode(mode); };
 camera.onfollow = (on) => $("follow").setAttribute("aria-pressed", String(on));
 for (const button of document.querySelectorAll("[data-layer]")) button.addEventListener("click", () => {
   const on = painter.layers[button.dataset.layer] = button.getAttribute("aria-pressed") !== "true";
   button.setAttribute("aria-pressed", String(on));
   schedule();
 });
-addEventListener("keydown", (event) => {
-  if (event.target.closest("input, select, dialog") || event.ctrlKey || event.metaKey) return;
-  const doing = { "+": () => camera.zoom(1.4), "-": () => camera.zoom(1 / 1.4), 0: () => $("fit").click(), f: () => $("follow").click() }[event.key];
-  if (doing) doing();
-});
 $("token").addEventListener("close", () => {
   const text = $("token-text").value.trim();
   $("token-text").value = "";
   if (text) { banner(""); link.use(text); }
-  else if (barred()) banner("Not shown without a token. Press here to give it, or open the address that lumiloop view printed.");
+  else if (barred()) banner("This page needs a token. Press here to enter it, or open the address that lumiloop view printed.");
 });
 $("banner").addEventListener("click", () => { if (barred()) $("token").showModal(); });
 new ResizeObserver(() => {
@@ -199,4 +221,4 @@ setInterval(schedule, 1000);
 theme(chosen());
 link.open();
 
-globalThis.lumiloop = { world, camera, link, late };   // for debugging and for the tests
+globalThis.lumiloop = { world, camera, link, late, events, plots, painter };   // for debugging and for the tests

@@ -3,6 +3,10 @@
 import { $, element } from "./panel.js";
 
 const KEPT = 4;
+const QUESTIONS = {     // commands that need a confirmation
+  relocalise: "The robot gives up its pose and searches for it in the whole map. The pose is not valid until it is found. Stop the robot first.",
+  pause: "Mapping stops, and the lidar no longer corrects the pose. Light and odometry continue. The state becomes DEGRADED until you resume.",
+};
 const SAID = { relocalise: "Relocalise", set_pose: "Set pose", save_map: "Save map", dump_recorder: "Dump recorder", pause: "Pause", resume: "Resume" };
 
 export class Orders {
@@ -15,8 +19,8 @@ export class Orders {
     for (const button of document.querySelectorAll("[data-order]")) button.addEventListener("click", () => this.press(button.dataset.order));
     $("ask-yes").addEventListener("click", () => this.send("set_pose", this.pose));
     $("ask-no").addEventListener("click", () => this.aim(false));
-    addEventListener("keydown", (event) => { if (event.key === "Escape") this.aim(false); });
     camera.onaimed = (aim) => this.aimed(aim);
+    $("confirm").addEventListener("close", () => { if ($("confirm").returnValue === "yes") this.send(this.asked); });
   }
 
   welcome(words) {
@@ -28,37 +32,50 @@ export class Orders {
       button.title = (words.orders[button.dataset.order] || "").replaceAll("`", "");
     }
     $("mode").hidden = Boolean(words.recording);
-    $("mode").textContent = may.length ? "may order" : "read-only";
+    $("mode").textContent = may.length ? "control" : "read-only";
     $("mode").classList.toggle("write", may.length > 0);
     $("write-note").textContent = may.length ? `you are viewer ${this.you}` : "";
   }
 
   press(name) {
-    if (name === "set_pose") this.aim(!this.camera.aiming);
+    if (name === "set_pose") this.aim(this.camera.mode !== "pose");
+    else if (QUESTIONS[name]) this.question(name);
     else this.send(name);
+  }
+
+  question(name) {
+    this.asked = name;
+    $("confirm-title").textContent = `${SAID[name]}?`;
+    $("confirm-text").textContent = QUESTIONS[name];
+    $("confirm-yes").textContent = SAID[name];
+    $("confirm").returnValue = "";
+    $("confirm").showModal();
   }
 
   send(name, pose) {
     if (this.link.say({ order: name, pose })) this.sent.push(name);
-    else this.take({ order: name, viewer: this.you, outcome: "not sent, there is no connection" });
-    this.aim(false);
+    else this.take({ order: name, viewer: this.you, outcome: "not sent, no connection" });
+    if (this.camera.mode === "pose") this.aim(false);
   }
 
   lost() {
     const unknown = this.sent.splice(0);
-    for (const order of unknown) this.take({ order, viewer: this.you, outcome: "connection lost, perhaps before it arrived" });
+    for (const order of unknown) this.take({ order, viewer: this.you, outcome: "connection lost, result unknown" });
   }
 
   // Switch dragging between a pose and the map.
   aim(on) {
-    this.camera.aiming = on;
-    this.camera.aim = null;
-    $("stage").classList.toggle("aim", on);
+    this.camera.setMode(on ? "pose" : "move");
+    if (on) $("stage").scrollIntoView({ block: "center" });
+  }
+
+  // The camera has another mode, also by a key.
+  mode(mode) {
+    const on = mode === "pose";
     $("ask").hidden = !on;
     $("ask-yes").hidden = true;
-    $("ask-text").textContent = "Press where the robot stands, drag to where it looks";
+    $("ask-text").textContent = "Press at the robot's position, drag to its heading";
     document.querySelector("[data-order=set_pose]").classList.toggle("on", on);
-    this.camera.changed();
   }
 
   aimed({ from, to }) {
@@ -77,9 +94,12 @@ export class Orders {
     this.told.length = Math.min(this.told.length, KEPT);
     const ended = order.outcome !== "running";
     const who = order.viewer === this.you ? "" : ` by viewer ${order.viewer}`;
-    if (ended || who) this.toast(`${SAID[order.order] || order.order}${who}: ${said(order)}`, order.outcome === "done" ? "good" : order.outcome === "running" ? "" : "bad");
+    if (ended || who) this.toast(this.worded(order), order.outcome === "done" ? "good" : order.outcome === "running" ? "" : "bad");
     this.show();
   }
+
+  // A command and its outcome in words.
+  worded(order) { return `${SAID[order.order] || order.order}${order.viewer === this.you ? "" : ` by viewer ${order.viewer}`}: ${said(order)}`; }
 
   show() {
     $("told").replaceChildren(...this.told.map((order) => {
@@ -92,6 +112,6 @@ export class Orders {
 
 function said(order) {
   if (order.outcome === "replaced") return order.by ? `replaced by viewer ${order.by}` : "replaced by another client";
-  if (order.outcome === "refused") return "refused; the daemon's log says why";
+  if (order.outcome === "refused") return "refused; see the daemon's log";
   return order.outcome;
 }

@@ -1,6 +1,7 @@
 // The map: tiles of log-odds as small images in the colours of the theme.
 
 const SEEN = 12, CLEAR = 8;   // log-odds, in units of the stream's 0.1, at which a cell has its full colour
+const FAINTEST = 0.92;        // share of the colour of a cell that is hardly free: it differs from an unknown one
 
 export const CAN_INFLATE = "DecompressionStream" in globalThis;   // Chrome 80, Firefox 113, Safari 16.4
 
@@ -33,27 +34,13 @@ export class Tiles {
     if (tile.number !== number || this.all.get(key) !== tile) return;
     tile.cells = cells && cells.some((cell) => cell !== 0) ? cells : null;
     tile.side = side;
-    tile.picture = tile.box = null;
+    tile.picture = null;
     this.changed();
   }
 
   repaint() {
     for (const tile of this.all.values()) tile.picture = null;
     this.changed();
-  }
-
-  // Bounding box (x0, y0, x1, y1) of the known cells, m; null: none.
-  extent() {
-    let box = null;
-    for (const tile of this.all.values()) {
-      if (!tile.cells) continue;
-      const x = tile.column * this.size, y = tile.row * this.size, m = this.size / tile.side;
-      if (!tile.box) tile.box = filled(tile);
-      if (tile.box[2] === 0) continue;
-      const own = [x + tile.box[0] * m, y + tile.box[1] * m, x + tile.box[2] * m, y + tile.box[3] * m];
-      box = box ? [Math.min(box[0], own[0]), Math.min(box[1], own[1]), Math.max(box[2], own[2]), Math.max(box[3], own[3])] : own;
-    }
-    return box;
   }
 
   draw(context, camera, colours) {
@@ -75,18 +62,6 @@ async function inflated(packed) {
   return new Int8Array(await new Response(stream).arrayBuffer());
 }
 
-function filled(tile) {
-  const { cells, side } = tile, box = [side, side, 0, 0];   // of occupied cells, not of those seen through a door
-  for (let row = 0, at = 0; row < side; row++) {
-    for (let column = 0; column < side; column++, at++) {
-      if (cells[at] <= 0) continue;
-      box[0] = Math.min(box[0], column); box[1] = Math.min(box[1], row);
-      box[2] = Math.max(box[2], column + 1); box[3] = Math.max(box[3], row + 1);
-    }
-  }
-  return box;
-}
-
 function painted(tile, colours) {
   const { cells, side } = tile;
   const picture = document.createElement("canvas");
@@ -105,7 +80,7 @@ function shadesOf({ wall, free }) {
   const shades = new Uint32Array(256);
   for (let value = -128; value < 128; value++) {
     const [r, g, b] = value > 0 ? wall : free;
-    const alpha = value > 0 ? Math.min(1, value / SEEN) : Math.min(1, -value / CLEAR);
+    const alpha = value > 0 ? Math.min(1, value / SEEN) : value < 0 ? Math.min(1, FAINTEST - value / CLEAR * (1 - FAINTEST)) : 0;
     shades[value + 128] = ((Math.round(255 * alpha) << 24) | (b << 16) | (g << 8) | r) >>> 0;
   }
   return shades;

@@ -1,9 +1,10 @@
 // The time bar of a recording.
 
+import { STATES } from "./colours.js";
 import { $, clock, put } from "./panel.js";
 import { COLUMNS } from "./world.js";
 
-const PLAY = "M5 3l12 7-12 7z", STAND = "M5 3h3v14H5zm7 0h3v14h-3z", STATES = ["faint", "bad", "teal", "good", "warn", "seek", "bad", "seek"];
+const PLAY = "M5 3l12 7-12 7z", STAND = "M5 3h3v14H5zm7 0h3v14h-3z";
 
 export class TimeBar {
   constructor(link, world) {
@@ -16,7 +17,7 @@ export class TimeBar {
     $("seek").addEventListener("input", () => { this.held = true; this.time(Number($("seek").value)); this.ask(); });
     $("seek").addEventListener("change", () => { this.held = false; });
     addEventListener("keydown", (event) => {
-      if (!this.film || event.target.closest("input, select, dialog")) return;
+      if (!this.film || event.target.closest("input, select, dialog, button")) return;
       if (event.key === " ") { event.preventDefault(); this.toggle(); }
       const step = { ArrowLeft: -5, ArrowRight: 5 }[event.key];
       if (step) link.say({ play: { at: this.film.at + step } });
@@ -59,7 +60,7 @@ export class TimeBar {
     context.globalAlpha = 1;
     const part = width / Math.max(1e-3, last - first);
     for (const [half, state] of this.seen) {
-      context.fillStyle = colours[STATES[state] || "faint"];
+      context.fillStyle = colours[STATES[state] || "none"];
       context.fillRect((half / 2 - first) * part, 0, Math.max(1, part / 2 + 0.5), 8);
     }
   }

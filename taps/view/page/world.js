@@ -2,7 +2,7 @@
 
 import { Tiles } from "./tiles.js";
 
-const POSES = 64, TRAIL = 8000, STEP_M = 0.02, LEAP_M = 0.6, LOOPS = 200, ROWS = 1200;
+const POSES = 64, TRAIL = 8000, STEP_M = 0.02, LEAP_M = 0.6, LOOPS = 200, ROWS = 1200, MARGIN_M = [2, 8];
 export const COLUMNS = { t: 0, x: 1, y: 2, yaw: 3, sigma: 4, bound: 5, cycle: 6, late: 7, used: 8, state: 9, jumps: 10, map: 11 };
 
 export class World {
@@ -20,7 +20,10 @@ export class World {
     this.loops = [];
     this.rows = [];
     this.faults = [];
+    this.margin = MARGIN_M[0];
+    this.box = null;         // of where the robot has been: x0, y0, x1, y1, m
     this.lampsPlaced = false;
+    this.chosen = null;      // number of the lamp whose details are shown
     this.dirty = true;
     if (!keepTiles) this.tiles.clear();
   }
@@ -45,7 +48,12 @@ export class World {
   }
 
   on_lights(data) { this.lights = data; }
-  on_scan(data) { this.scan = { ...data, ranges: floats(data.ranges) }; }
+  on_scan(data) {
+    this.scan = { ...data, ranges: floats(data.ranges) };
+    const ranges = this.scan.ranges.filter((range) => range > 0.02 && range < Infinity).sort();
+    this.margin = Math.max(this.margin, Math.min(MARGIN_M[1], ranges[ranges.length >> 1] || 0));
+  }
+
   on_statistics(data) { this.statistics = data; }
   on_faults(data) { this.faults = data.present; }
   on_map(data) { this.tiles.take(data); }
@@ -54,6 +62,7 @@ export class World {
 
   on_loop(data, since = performance.now()) {
     this.loops.push({ ...data, since });
+    for (const at of [data.at_new, data.at_old]) if (at) this.include(at);
     if (this.loops.length > LOOPS) this.loops.shift();
   }
 
@@ -75,12 +84,20 @@ export class World {
 
   walk(pose, state, jumps, map) {
     const last = this.trail[this.trail.length - 1];
+    if (last && last.map !== map) this.box = null;
+    this.include(pose);
     const way = last ? Math.hypot(pose[0] - last.x, pose[1] - last.y) : Infinity;
     if (last && way < STEP_M && last.state === state) return;
     if (last && last.map !== map) this.trail = [];
     const torn = !last || way > LEAP_M || (last.jumps !== jumps && way > 0.1);
     this.trail.push({ x: pose[0], y: pose[1], state, jumps, map, torn });
     if (this.trail.length > TRAIL) this.trail.splice(0, TRAIL / 8);
+  }
+
+  // The robot has been there.
+  include([x, y]) {
+    const box = this.box || [x, y, x, y];
+    this.box = [Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x), Math.max(box[3], y)];
   }
 
   // The interpolated pose at a time; null: no poses.
@@ -94,6 +111,14 @@ export class World {
     const part = (t - a.t) / (b.t - a.t);
     if (Math.hypot(b.pose[0] - a.pose[0], b.pose[1] - a.pose[1]) > 0.3) return b.pose;
     return a.pose.map((value, k) => value + part * (k === 2 ? turned(b.pose[2] - a.pose[2]) : b.pose[k] - value));
+  }
+
+  // Bounding box (x0, y0, x1, y1) of where the robot has been, m, with the room about it; null: not known.
+  // The margin is the largest median range of a scan: beams through glass or a door are too few to change it.
+  been() {
+    if (!this.box) return null;
+    const [x0, y0, x1, y1] = this.box, { margin } = this;
+    return [x0 - margin, y0 - margin, x1 + margin, y1 + margin];
   }
 
   // The latest scan as points of the map, x and y alternating; null: no scan or no pose.

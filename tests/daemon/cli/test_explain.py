@@ -93,8 +93,8 @@ def test_a_register_in_the_middle_of_a_value_is_that_value(capsys: pytest.Captur
 
 
 def test_names_in_any_case(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "two witnesses agree" in _told(capsys, "tracking")
-    assert "weaker than it can be here" in _told(capsys, "OCCLUDED")
+    assert "two solutions agree" in _told(capsys, "tracking")
+    assert "weaker than expected here" in _told(capsys, "OCCLUDED")
 
 
 def test_what_is_not_known_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:

@@ -132,7 +132,7 @@ def test_what_is_not_known_reads_so(capsys: pytest.CaptureFixture[str]) -> None:
 def test_reasons_and_faults_come_with_a_remedy(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_against(snapshot(reason=4, fault=101), advance=False) == 0
     shown = capsys.readouterr().out
-    silent = "no valid scan for three scan periods, or not steadily again"
+    silent = "no valid scan for three scan periods, or scans do not arrive steadily yet"
     assert f"reason     4: {silent} (check the lidar's power and cable)\n" in shown
     assert "fault      101: the lidar is not there (" in shown
 

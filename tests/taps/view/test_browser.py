@@ -20,12 +20,13 @@ pytestmark = [
 POSE = "globalThis.lumiloop && lumiloop.world.pose && lumiloop.world.pose.pose"
 PHONE = (390, 844)
 NARROWEST, TABLET = 320, 768
-SLOW = """import("./panel.js").then(({Panel}) => {
+SLOW = """Promise.all([import("./panel.js"), import("./cycle.js")]).then(([{Panel}, {Cycle}]) => {
+    document.getElementById("card-cycle").open = true;
     const pose = {pose: [0, 0, 0], covariance: null, known: [true, true, true], state: 3, map_id: 1, jumps: 0};
     const panel = new Panel({pose: {...pose, velocity: [0, 0, -0.001]}});
     panel.pose();
-    panel.bars([["cycle", [105750, 151200, 200000], "total"]], 50000);
-    const figures = document.querySelector(".bars .row span:last-child");
+    new Cycle({}).bars([["cycle", [105750, 151200, 200000], "total"]], 50000);
+    const figures = document.querySelector(".bars .row.total span:last-child");
     return [Math.round(figures.offsetHeight / parseFloat(getComputedStyle(figures).lineHeight)),
             document.getElementById("speed").textContent];
 })"""
@@ -39,10 +40,10 @@ HEAD = """(() => {
   return [
     name.textContent, all.every((one) => inside(one.getBoundingClientRect())), name.scrollWidth - name.clientWidth,
     document.querySelector("header").getBoundingClientRect().bottom,
-    parseFloat(getComputedStyle(document.getElementById("stage")).top),
+    parseFloat(getComputedStyle(document.documentElement).scrollPaddingTop),
   ];
 })()"""
-"""The robot's name, whether all of the head is in view, what is cut off of the name, where head ends and map stays."""
+"""The robot's name, whether all of the head is in view, what is cut off of the name, where head ends, what it hides."""
 FIRST_PAINT_MS, SHOWN_MS = 1000.0, 150.0
 SLACK = 4.0
 """Of times that are measured on a machine that others use."""
@@ -93,6 +94,7 @@ def test_the_page_loads_and_the_pose_moves(browser: str, address: str) -> None:
         )
         await page.until("[...lumiloop.world.tiles.all.values()].some((tile) => tile.picture)")
         await page.until("lumiloop.world.points() && lumiloop.world.points().length > 400")
+        await page.js("document.getElementById('card-cycle').open = true")
         await page.until(
             "document.querySelectorAll('.link').length >= 4 && document.querySelectorAll('.bars .row').length >= 5"
         )
@@ -117,6 +119,7 @@ def test_a_click_relocalises_and_who_only_looks_sees_it(browser: str, address: s
             assert await other.js("document.getElementById('card-orders').hidden")
             await page.js("globalThis.seen = []; lumiloop.world.on_state = (told) => seen.push(told.state_name)")
             await page.click("[data-order=relocalise]")
+            await page.click("#confirm-yes")
             await page.until("document.querySelector('#told li')")
             # where several places fit by the time that it is told, it says so at once
             await page.until("seen.includes('RELOCATING') || seen.includes('AMBIGUOUS')", 60.0)
@@ -153,7 +156,7 @@ def test_a_phone(browser: str, address: str) -> None:
         box = await page.js(
             "(({width, height}) => [width, height])(document.getElementById('stage').getBoundingClientRect())"
         )
-        assert box[0] == PHONE[0]
+        assert 0.9 * PHONE[0] < box[0] <= PHONE[0]
         assert 0.3 * PHONE[1] < box[1] < 0.7 * PHONE[1]
         small = await page.js(
             "[...document.querySelectorAll('header button, .tools button, [data-order]')].filter((e) => e.offsetParent)"
@@ -175,7 +178,7 @@ def test_a_phone(browser: str, address: str) -> None:
             assert name.startswith("demo-")  # which of several robots this is
             assert within, width
             assert cut <= 0
-            assert end == below  # and the map stays below the head
+            assert end <= below  # what gets the focus is not behind the head
 
     look(browser, address, body, size=PHONE, phone=True)
 
@@ -209,7 +212,7 @@ def test_a_token_that_is_pasted_after_a_refusal_is_tried(browser: str, address: 
         await page.js("lumiloop.link.refused = 'token'; lumiloop.link.socket.close()")
         await page.until("lumiloop.link.socket === null")
         await page.js(f"location.hash = {address.partition('#')[2]!r}")
-        await page.until("lumiloop.link.socket && document.getElementById('mode').textContent === 'may order'", 20.0)
+        await page.until("lumiloop.link.socket && document.getElementById('mode').textContent === 'control'", 20.0)
 
     look(browser, address.partition("#")[0], body)
 
@@ -226,7 +229,7 @@ def test_a_connection_that_answers_no_more_is_opened_again_and_orders_are_not_lo
         await page.until("lumiloop.link.socket !== first")
         await page.js("document.querySelector('[data-order=save_map]').click()")
         said = await page.js("document.getElementById('toasts').textContent")
-        assert "not sent, there is no connection" in said
+        assert "not sent, no connection" in said
         await page.js("globalThis.before = lumiloop.world.pose.seq")
         await page.until("lumiloop.link.socket && lumiloop.world.pose && lumiloop.world.pose.seq !== before")
         await page.until("document.getElementById('banner').hidden")

@@ -94,16 +94,17 @@ async def test_a_dead_wire_is_no_daemon_that_stands_and_the_page_comes_back(brow
         house.stream.publish(snapshot(1))
         await page.until(f"{POSE} === 1")
         wire.cut = True
-        await page.click("[data-order=relocalise]")  # into a wire that takes it
+        await page.click("[data-order=relocalise]")
+        await page.click("#confirm-yes")  # into a wire that takes it
         await page.js(f"globalThis.told = []; setInterval(() => told.push({BANNER}), 50); 0")
-        await shows(page, "No connection to this page")
-        assert not [text for text in await page.js("told") if "the daemon stands" in text]
+        await shows(page, "No connection to the page")
+        assert not [text for text in await page.js("told") if "the daemon does not respond" in text]
         await page.until("document.getElementById('state-name').textContent === 'NO SERVER'")
         await page.until("document.getElementById('told').textContent.includes('connection lost')")
         await page.click("[data-order=save_map]")
         await page.until(
             "[...document.querySelectorAll('#told li')].some((one) =>"
-            "one.textContent.includes('Save map (you): not sent, there is no connection'))"
+            "one.textContent.includes('Save map (you): not sent, no connection'))"
         )
         wire.cut = False
         house.stream.publish(snapshot(2))
@@ -134,7 +135,7 @@ async def test_a_daemon_that_stands_is_still_named(browser: str, tmp_path: Path)
         await page.until("globalThis.lumiloop")
         house.stream.publish(snapshot(1))
         await page.until(f"{POSE} === 1")
-        await shows(page, "the daemon stands")
+        await shows(page, "the daemon does not respond")
 
 
 async def test_who_closes_the_question_for_a_token_is_told_why_nothing_is_shown_and_is_asked_again(
@@ -146,7 +147,7 @@ async def test_who_closes_the_question_for_a_token_is_told_why_nothing_is_shown_
         await page.until("document.getElementById('state-name').textContent === 'NO TOKEN'")
         assert "trying again" not in await page.js("document.body.innerText")
         await page.js("document.getElementById('token').close()")  # as Escape does
-        await shows(page, "Not shown without a token")
+        await shows(page, "needs a token")
         await page.click("#banner")
         await page.until("document.getElementById('token').open")
         await page.js(f"document.getElementById('token-text').value = '{TOKEN}'; 0")

@@ -234,7 +234,7 @@ async def test_what_cannot_be_shown_ends_nothing(tmp_path: Path, monkeypatch: py
         await page.welcome()
         monkeypatch.setattr(house.view.hub, "distribute", lambda data: 1 / 0)
         house.stream.publish(snapshot(1))
-        await page.until("daemon", lambda told: "could not be shown" in told["why"])
+        await page.until("daemon", lambda told: "internal error" in told["why"])
         monkeypatch.undo()
         await page.until("daemon", lambda told: told["up"])
         await until(lambda: house.stream.wanted("pose"))
