@@ -24,7 +24,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from daemon.runtime.cache_complaint import CacheComplaint
 from daemon.system.atomic_file import sync_folder, write_whole
 from daemon.system.kernel_lock import KernelLock, before_compiling, waits
 from hal.blocking_calls import run_in_thread
@@ -195,9 +194,8 @@ def mark_of(what: str) -> Path:
     """Returns the mark file, which exists once an earlier start has compiled all that this one needs."""
     from estimator import CACHE_DIR
 
-    # the directory is named by the sources' content; numba also keys by the path they were loaded from, and by the
-    # processor: a disk may be put into another computer
-    key = f"{ROOM} {os.environ.get('NUMBA_CPU_NAME') or _processor()}"
+    # the directory is named by the sources' content; a disk may be put into a computer with another processor
+    key = os.environ.get("NUMBA_CPU_NAME") or _processor()
     return CACHE_DIR / f"{what}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
 
 
@@ -239,7 +237,7 @@ def is_warm(lights: bool) -> bool:
 
 
 def _load(begun: float, lights: Lights | None) -> Warmth:
-    from estimator import CACHE_DIR
+    from estimator import CACHE_DIR, CACHE_REPORT
 
     what = _what(lights is not None)
     with KernelLock(CACHE_DIR) as lock:
@@ -254,12 +252,11 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
                 "first start of this version: compiling its %d kernels, or what is missing of them (a minute or two)",
                 count,
             )
-        complaint = CacheComplaint()
+        before = len(CACHE_REPORT.damaged)
 
         def missing() -> None:
             """Takes the lock when a kernel is missing despite the mark."""
             nonlocal compiled
-            complaint.log()
             lock.acquire()
             compiled = True
 
@@ -268,8 +265,8 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
             code_us = 0.0 if lights is None else _exercise_lights(lights)
         if cold:
             _mark(what)
-    damaged, unwritten = complaint.result()
-    return Warmth(compiled, time.monotonic() - begun, code_us, damaged, unwritten)
+    damaged = len(CACHE_REPORT.damaged) - before
+    return Warmth(compiled, time.monotonic() - begun, code_us, damaged, CACHE_REPORT.unwritten)
 
 
 def _mark(what: str) -> None:
