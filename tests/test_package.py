@@ -31,8 +31,8 @@ def test_every_file_is_in_the_wheel() -> None:
 
 
 def test_the_installer_takes_every_room() -> None:
-    (line,) = (line for line in (ROOT / "systemd/install.sh").read_text().splitlines() if "pyproject.toml" in line)
-    assert set(ROOMS) <= set(line.split())
+    (line,) = re.findall(r"^SHIPPED: Final = \((.*)\)", (ROOT / "systemd/environment.py").read_text(), re.MULTILINE)
+    assert set(ROOMS) <= set(re.findall(r'"(\w+)"', line))
 
 
 def test_locks_have_everything_that_is_named() -> None:
