@@ -220,5 +220,5 @@ def test_a_kill_at_any_change_of_a_file_leaves_a_version(packages: Bench, order:
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("order", ["build", "compose"])
-def test_a_kill_at_every_change_of_a_file_leaves_a_version(packages: Bench, order: str) -> None:
-    kills(packages, order, share=1)
+def test_a_kill_at_more_changes_of_files_leaves_a_version(packages: Bench, order: str) -> None:
+    kills(packages, order, share=7)
