@@ -65,7 +65,7 @@ def tree(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def package(folder: Path, tree: Path) -> Path:
-    """The Debian package of that tree."""
+    """The Debian package of that tree; that of the taps lies beside it."""
     out = folder / "package"
     environment = {**os.environ, "TREE": str(tree), "PYTHON": "/usr/bin/python3"}
     done = subprocess.run([ROOT / "systemd/package.sh", out], check=True, env=environment, capture_output=True)
@@ -93,9 +93,9 @@ def machine(folder: Path, package: Path, lidar: Path) -> Iterator[Container]:
     """A Debian with the package installed by its own package manager."""
     root = folder / "root"
     container.unpack(root)
-    package.rename(root / "package.deb")
-    container.inside(root, "dpkg", "-i", "/package.deb")
-    (root / "package.deb").unlink()
+    for path in package.parent.glob("*.deb"):
+        path.rename(root / path.name)
+    container.inside(root, "dpkg", "-i", f"/{package.name}")
     (root / "etc/lumiloop/lumiloop.toml").write_text(CONFIG)
     drop_in = root / "etc/systemd/system/lumiloop.service.d"
     drop_in.mkdir(parents=True)
@@ -113,15 +113,16 @@ def left_out(machine: Container, warm_kernels: None) -> list[Path]:
 
 
 def listing(tree: Path) -> dict[str, str]:
-    """Every file with what is in it."""
+    """Every file with what is in it, whatever the folder of the environment is called."""
     found = {}
     for path in sorted(tree.rglob("*")):
-        if path.relative_to(tree).parts[0] == "DEBIAN":
+        name = re.sub(r"^(opt/lumiloop-versions)/[^/]+/", r"\1/*/", str(path.relative_to(tree)))
+        if name.startswith(("DEBIAN/", "usr/lib/lumiloop/")) or name in ("opt/lumiloop", "opt/lumiloop-versions/.lock"):
             continue
         if path.is_symlink():
-            found[str(path.relative_to(tree))] = f"-> {path.readlink()}"
+            found[name] = f"-> {path.readlink()}"
         elif path.is_file():
-            found[str(path.relative_to(tree))] = hashlib.sha256(path.read_bytes()).hexdigest()
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found
 
 
@@ -250,6 +251,25 @@ def test_the_first_start_of_a_version_compiles_everything_under_the_unit_s_restr
     machine.run("systemctl", "start", UNIT, seconds=COMPILE_S)
     machine.until(UNIT, READY_S, ActiveState="active", SubState="running")
     assert list((machine.root / CACHE).glob("kernels-*/warm-*"))  # made when all have been compiled
+
+
+def test_the_taps_come_with_their_libraries_and_stay_through_an_upgrade(machine: Container) -> None:
+    """The daemon that runs keeps its files until it is started anew, which the upgrade does."""
+    core = next(path.name for path in machine.root.glob("lumiloop_*.deb"))
+    taps = next(path.name for path in machine.root.glob("lumiloop-taps_*.deb"))
+    needs = ("/opt/lumiloop/bin/python", "-c", "import aiohttp, foxglove, mcap, rosbags, zenoh")
+    versions = machine.root / "opt/lumiloop-versions"
+    for order in (taps, core):
+        before = _main(machine)
+        machine.run("dpkg", "-i", f"/{order}", seconds=300.0)
+        _restarted(machine, before, READY_S)
+        machine.run(*needs)
+    assert len([path for path in versions.iterdir() if path.name[0] != "."]) <= 2
+    assert machine.show(UNIT, "Result") == {"Result": "success"}
+    machine.run("dpkg", "--remove", "lumiloop-taps")
+    assert "No module named" in machine.run(*needs, check=False)
+    for path in machine.root.glob("*.deb"):
+        path.unlink()
 
 
 def test_it_stops_cleanly(machine: Container) -> None:
