@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import gc
 import hashlib
 import logging
@@ -26,6 +25,7 @@ from typing import TYPE_CHECKING, Final
 
 from daemon.system.atomic_file import sync_folder, write_whole
 from daemon.system.kernel_lock import KernelLock, before_compiling, waits
+from daemon.system.memory_limit import REMEDY, lacks_memory
 from hal.blocking_calls import run_in_thread
 
 if TYPE_CHECKING:
@@ -123,12 +123,9 @@ def load(lights: Lights | None = None) -> Warmth:
 
 
 def _cause_of(error: BaseException) -> str:
-    """Readable cause of a failure to load; a memory limit appears as a library that cannot be mapped."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, MemoryError) or os.strerror(errno.ENOMEM) in str(cause):
-            return f"not enough memory to load the kernels ({error}); raise MemoryMax=, or the limit of `ulimit -v`"
-        cause = cause.__cause__ or cause.__context__
+    """Readable cause of a failure to load."""
+    if lacks_memory(error):
+        return f"not enough memory to load the kernels; {REMEDY}"
     return f"kernels cannot be loaded: {error}"
 
 
