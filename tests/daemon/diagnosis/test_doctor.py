@@ -86,6 +86,7 @@ class Computer(Host):
         return "Name or service not known" if host == "nohost" else ""
 
     def warm(self, photodiode: PhotodiodeConfig) -> Warmth | None:
+        assert photodiode.fitted
         if self.no_cache:
             raise CannotLoad(self.no_cache)
         return self.warmth
