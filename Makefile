@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Suites share the processors, and what is judged against the wall clock wants them alone: no two at once, -j or not.
 .NOTPARALLEL:
 
-.PHONY: help venv demo check quick test cover test-system test-all bless hooks bench bench-vm experiments install uninstall deb lock docs clean fuzz power-cuts soak arm
+.PHONY: help venv demo check quick test cover test-system test-all bless hooks bench bench-vm experiments install uninstall deb lock docs clean fuzz soak arm
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -86,6 +86,10 @@ bless: venv  ## make today's trajectories the golden ones: REASON="why they have
 	@test -n "$$REASON" || { echo 'say why the trajectories have changed: make bless REASON="..."'; exit 1; }
 	$(RUN) -m tests.logs.bless --reason "$$REASON" $(ARGS)
 
+.PHONY: power-cuts
+power-cuts: venv  ## 120 power cuts on a block device in starts, saves and an upgrade (root; ARGS="24": so many)
+	$(RUN) -m tests.faults.power $(ARGS)
+
 hooks: venv  ## run the checks of `make check` before each commit (git hook of pre-commit)
 	$(BIN)/pre-commit install
 
@@ -101,9 +105,6 @@ bench-vm: venv  ## the package in an emulated Debian with real kernel interfaces
 
 fuzz: venv  ## damaged bytes to every parser, a tenth of the full size (ARGS="-m slow": all of it; ARGS="-k log")
 	$(BIN)/python -m pytest -q tests/fuzz/test_parsers.py -m "not slow" $(ARGS)
-
-power-cuts: venv  ## 120 power cuts on a block device in starts, saves and an upgrade (root; ARGS="24": so many)
-	$(RUN) -m tests.faults.power $(ARGS)
 
 soak: venv  ## a simulated day, or ARGS="--days 30", ARGS="--real 60": does anything grow?
 	$(RUN) -m tools.soak $(ARGS)
@@ -124,7 +125,7 @@ install:  ## into /opt/lumiloop with its units, rules and example configuration 
 uninstall:  ## remove that; configuration and maps stay unless PURGE=1
 	systemd/install.sh uninstall
 
-deb:  ## the same as a Debian package, in out/
+deb:  ## the same as two Debian packages, in out/: lumiloop and lumiloop-taps
 	systemd/package.sh
 
 EXTRAS  := --extra plot --extra mcap --extra foxglove --extra view --extra zenoh
