@@ -86,6 +86,10 @@ bless: venv  ## make today's trajectories the golden ones: REASON="why they have
 	@test -n "$$REASON" || { echo 'say why the trajectories have changed: make bless REASON="..."'; exit 1; }
 	$(RUN) -m tests.logs.bless --reason "$$REASON" $(ARGS)
 
+.PHONY: power-cuts
+power-cuts: venv  ## 120 power cuts on a block device in starts, saves and an upgrade (root; ARGS="24": so many)
+	$(RUN) -m tests.faults.power $(ARGS)
+
 hooks: venv  ## run the checks of `make check` before each commit (git hook of pre-commit)
 	$(BIN)/pre-commit install
 
@@ -130,7 +134,7 @@ install:  ## into /opt/lumiloop with its units, rules and example configuration 
 uninstall:  ## remove that; configuration and maps stay unless PURGE=1
 	systemd/install.sh uninstall
 
-deb:  ## the same as a Debian package, in out/
+deb:  ## the same as two Debian packages, in out/: lumiloop and lumiloop-taps
 	systemd/package.sh
 
 EXTRAS  := --extra plot --extra images --extra mcap --extra foxglove --extra view --extra zenoh

@@ -1,10 +1,11 @@
 #!/bin/sh
 # Installs lumiloop into a virtual environment of its own, with its units, rules and example configuration; or removes
-# exactly that. `make install` and `make uninstall` call it, and the Debian package is what it yields. `install.sh files`
-# lays down all but the environment, which stays as it is.
+# exactly that. An upgrade that fails or is interrupted leaves the version of before. `make install` and `make uninstall`
+# call it, and the Debian package is what it yields. `install.sh files` lays down all but the environment, which stays
+# as it is.
 #
 #   DESTDIR   put everything below this directory (a package's root); empty: into the system
-#   PREFIX    the virtual environment, default /opt/lumiloop
+#   PREFIX    the virtual environment, default /opt/lumiloop; a link into $PREFIX-versions (environment.py)
 #   PYTHON    interpreter to build it with, default /usr/bin/python3 (3.11 or newer)
 #   PURGE     with uninstall: 1 removes configuration, maps and caches too
 set -eu
@@ -13,12 +14,10 @@ PREFIX=${PREFIX:-/opt/lumiloop}
 DESTDIR=${DESTDIR:-}
 PYTHON=${PYTHON:-/usr/bin/python3}
 SOURCE=$(cd "$(dirname "$0")/.." && pwd)
-ROOT=${DESTDIR}${PREFIX}
 UNITS=/usr/lib/systemd/system
 SHELLS="bash zsh fish"
 TAP_UNITS="lumiloop-view.service lumiloop-foxglove.service lumiloop-metrics.service lumiloop-record.service lumiloop-ros2.service lumiloop-fleet.service lumiloop-fleet-router.service"
 UNIT_FILES="lumiloop.service lumiloop-warmup.service lumiloop-lamps.service lumiloop-lamps.timer $TAP_UNITS"
-MARK=.lumiloop
 
 say() { echo "lumiloop: $*"; }
 
@@ -28,39 +27,16 @@ fail() {
 }
 
 put() { # mode, file below the source, place
-    install -D -m "$1" "$SOURCE/$2" "$DESTDIR$3"
+    install -D -m "$1" "$SOURCE/$2" "$INTO$3"
 }
 
-ours() { # whether the environment's place may be removed: only what an installation has made, whatever PREFIX says
-    if [ ! -e "$ROOT" ] || [ -e "$ROOT/$MARK" ] || [ -z "$(ls -A "$ROOT")" ]; then return; fi
-    fail "$ROOT is not an installation of lumiloop; PREFIX must name a directory of its own, as /opt/lumiloop"
-}
-
-environment() {
+suitable() {
     "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || fail "$PYTHON is older than 3.11; name another one: PYTHON=..."
     "$PYTHON" -c 'import venv, ensurepip' 2> /dev/null || fail "the venv module is missing: apt-get install python3-venv"
-    rm -rf "$ROOT"
-    mkdir -p "$ROOT"
-    touch "$ROOT/$MARK"
-    "$PYTHON" -m venv "$ROOT"
-    "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r "$SOURCE/requirements/core.lock"
-    wheel=$(mktemp -d)
-    tar -C "$SOURCE" -cf - pyproject.toml README.md LICENSE daemon hal estimator taps tools/__init__.py tools/demo tools/sim | tar -C "$wheel" -xf -
-    PIP_CONSTRAINT="$SOURCE/requirements/build.txt" "$ROOT/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --no-deps "$wheel"
-    rm -rf "$wheel"
-    "$ROOT/bin/python" -m pip uninstall --quiet --disable-pip-version-check --yes setuptools pip
-    rm -f "$ROOT"/bin/activate* "$ROOT"/bin/Activate.ps1 "$ROOT"/bin/pip* "$ROOT"/bin/wheel
-    # made below DESTDIR, to be run without it
-    for script in "$ROOT"/bin/*; do
-        if [ ! -L "$script" ]; then sed -i "1s|$ROOT|$PREFIX|" "$script"; fi
-    done
-    sed -i "s|$ROOT|$PREFIX|g" "$ROOT/pyvenv.cfg"
-    find "$ROOT" -name direct_url.json -delete
-    find "$ROOT/lib" -type d -name tests -prune -exec rm -rf {} +
-    find "$ROOT" -name __pycache__ -prune -exec rm -rf {} +
-    "$PYTHON" -m compileall -q -j 0 -s "$DESTDIR" --invalidation-mode checked-hash "$ROOT/lib" || true
-    mkdir -p "$DESTDIR/usr/bin"
-    ln -sfn "$PREFIX/bin/lumiloop" "$DESTDIR/usr/bin/lumiloop"
+}
+
+environments() { # order; see there
+    DESTDIR=$DESTDIR PREFIX=$PREFIX PYTHON=$PYTHON "$PYTHON" -B "$SOURCE/systemd/environment.py" "$@"
 }
 
 manual() { # a command of this source that prints or writes help; it needs no installed package
@@ -75,22 +51,24 @@ completion() { # the place of a shell's completion script
     esac
 }
 
-files() {
+files() { # all of them are written first, and then renamed to their places
+    INTO=$(mktemp -d)
+    trap 'rm -rf "$INTO"' EXIT
     for unit in $UNIT_FILES; do
-        install -d "$DESTDIR$UNITS"
-        sed "s|/opt/lumiloop|$PREFIX|g" "$SOURCE/systemd/$unit" > "$DESTDIR$UNITS/$unit"
-        chmod 644 "$DESTDIR$UNITS/$unit"
+        install -d "$INTO$UNITS"
+        sed "s|/opt/lumiloop|$PREFIX|g" "$SOURCE/systemd/$unit" > "$INTO$UNITS/$unit"
+        chmod 644 "$INTO$UNITS/$unit"
     done
     put 644 systemd/60-lumiloop.rules /usr/lib/udev/rules.d/60-lumiloop.rules
     put 644 systemd/lumiloop.catalog /usr/lib/systemd/catalog/lumiloop.catalog
     put 644 systemd/lumiloop.sysusers /usr/lib/sysusers.d/lumiloop.conf
     put 644 README.md /usr/share/doc/lumiloop/README.md
     put 644 LICENSE /usr/share/doc/lumiloop/copyright
-    ln -sfn copyright "$DESTDIR/usr/share/doc/lumiloop/LICENSE" # as README.md names it
+    ln -sfn copyright "$INTO/usr/share/doc/lumiloop/LICENSE" # as README.md names it
     for example in port-502 stream-group; do
         put 644 systemd/drop-ins/$example.conf /usr/share/doc/lumiloop/examples/$example.conf
     done
-    recorder=$DESTDIR/usr/share/doc/lumiloop/examples/flight-recorder.conf
+    recorder=$INTO/usr/share/doc/lumiloop/examples/flight-recorder.conf
     sed "s|/opt/lumiloop|$PREFIX|g" "$SOURCE/systemd/drop-ins/flight-recorder.conf" > "$recorder"
     chmod 644 "$recorder"
     (cd "$SOURCE/systemd" && find . -name '*.toml') | while read -r example; do
@@ -102,19 +80,22 @@ files() {
     for program in "$SOURCE"/tools/clients/[!_]* "$SOURCE"/tools/transmitter/[!_]*; do
         if [ -f "$program" ]; then put 644 "${program#"$SOURCE/"}" "/usr/share/doc/lumiloop/${program#"$SOURCE/"}"; fi
     done
-    manual man --out "$DESTDIR/usr/share/man/man1" > /dev/null
+    manual man --out "$INTO/usr/share/man/man1" > /dev/null
     for shell in $SHELLS; do
-        place=$DESTDIR/$(completion "$shell")
+        place=$INTO/$(completion "$shell")
         install -d "$(dirname "$place")"
         manual completion "$shell" > "$place"
     done
-    ln -sfn examples "$DESTDIR/usr/share/doc/lumiloop/systemd" # as the pages name them
-    for code in "$ROOT"/lib/python3*/site-packages/estimator; do # relative: it holds below DESTDIR, too
-        if [ -d "$code" ]; then ln -sfnr "$code" "$DESTDIR/usr/share/doc/lumiloop/estimator"; fi
+    ln -sfn examples "$INTO/usr/share/doc/lumiloop/systemd" # as the pages name them
+    for code in "$DESTDIR$PREFIX"/lib/python3*/site-packages/estimator; do # relative: it holds below DESTDIR, too
+        if [ -d "$code" ]; then ln -sfn "../../../..${code#"$DESTDIR"}" "$INTO/usr/share/doc/lumiloop/estimator"; fi
     done
+    mkdir -p "$INTO/usr/bin"
+    ln -sfn "$PREFIX/bin/lumiloop" "$INTO/usr/bin/lumiloop"
     if [ ! -e "$DESTDIR/etc/lumiloop/lumiloop.toml" ]; then
         put 644 systemd/lumiloop.toml /etc/lumiloop/lumiloop.toml
     fi
+    environments lay "$INTO"
 }
 
 tell_system() {
@@ -130,8 +111,8 @@ tell_system() {
 
 case "${1:-}" in
     install)
-        ours
-        environment
+        suitable
+        environments build
         files
         tell_system install
         if [ -n "$DESTDIR" ]; then
@@ -144,11 +125,12 @@ case "${1:-}" in
         files
         ;;
     uninstall)
-        ours
+        environments check
         if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
             systemctl disable --now $UNIT_FILES 2> /dev/null || true
         fi
-        rm -rf "$ROOT" "$DESTDIR/usr/share/doc/lumiloop"
+        environments remove
+        rm -rf "$DESTDIR/usr/share/doc/lumiloop"
         for unit in $UNIT_FILES; do rm -f "$DESTDIR$UNITS/$unit"; done
         for shell in $SHELLS; do rm -f "$DESTDIR/$(completion "$shell")"; done
         rm -f "$DESTDIR"/usr/share/man/man1/lumiloop.1 "$DESTDIR"/usr/share/man/man1/lumiloop-*.1

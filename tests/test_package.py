@@ -35,9 +35,8 @@ def test_every_file_is_in_the_wheel() -> None:
 
 
 def test_the_installer_takes_every_room() -> None:
-    (line,) = (line for line in (ROOT / "systemd/install.sh").read_text().splitlines() if "pyproject.toml" in line)
-    words = {word.removesuffix("/__init__.py").replace("/", ".") for word in line.split()}
-    assert set(ROOMS) <= words
+    (line,) = re.findall(r"^SHIPPED: Final = \((.*)\)", (ROOT / "systemd/environment.py").read_text(), re.MULTILINE)
+    assert {room.split(".")[0] for room in ROOMS} <= set(re.findall(r'"(\w+)"', line))
     assert (ROOT / "tools/demo/run.py").exists(), "`lumiloop demo` loads it by name"
 
 

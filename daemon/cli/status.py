@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Final
 
 from daemon.cli.reports.output import print_report
 from daemon.cli.reports.status import as_object
+from daemon.cli.reports.terminal_screen import Screen, key, keyboard
 from daemon.cli.status_table import as_table
 from daemon.publish.modbus.client import NoAnswer, Reader, Reading
 from daemon.publish.modbus.points import Value
 from daemon.publish.port_owner import Whose
-from daemon.system.terminal_screen import Screen, key, keyboard
 
 if TYPE_CHECKING:
     from daemon.config.schema import Config

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import gc
 import hashlib
 import logging
@@ -24,9 +23,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from daemon.runtime.cache_complaint import CacheComplaint
 from daemon.system.atomic_file import sync_folder, write_whole
 from daemon.system.kernel_lock import KernelLock, before_compiling, waits
+from daemon.system.memory_limit import REMEDY, lacks_memory
 from hal.blocking_calls import run_in_thread
 
 if TYPE_CHECKING:
@@ -124,12 +123,9 @@ def load(lights: Lights | None = None) -> Warmth:
 
 
 def _cause_of(error: BaseException) -> str:
-    """Readable cause of a failure to load; a memory limit appears as a library that cannot be mapped."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, MemoryError) or os.strerror(errno.ENOMEM) in str(cause):
-            return f"not enough memory to load the kernels ({error}); raise MemoryMax=, or the limit of `ulimit -v`"
-        cause = cause.__cause__ or cause.__context__
+    """Readable cause of a failure to load."""
+    if lacks_memory(error):
+        return f"not enough memory to load the kernels; {REMEDY}"
     return f"kernels cannot be loaded: {error}"
 
 
@@ -195,9 +191,8 @@ def mark_of(what: str) -> Path:
     """Returns the mark file, which exists once an earlier start has compiled all that this one needs."""
     from estimator import CACHE_DIR
 
-    # the directory is named by the sources' content; numba also keys by the path they were loaded from, and by the
-    # processor: a disk may be put into another computer
-    key = f"{ROOM} {os.environ.get('NUMBA_CPU_NAME') or _processor()}"
+    # the directory is named by the sources' content; a disk may be put into a computer with another processor
+    key = os.environ.get("NUMBA_CPU_NAME") or _processor()
     return CACHE_DIR / f"{what}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
 
 
@@ -239,7 +234,7 @@ def is_warm(lights: bool) -> bool:
 
 
 def _load(begun: float, lights: Lights | None) -> Warmth:
-    from estimator import CACHE_DIR
+    from estimator import CACHE_DIR, CACHE_REPORT
 
     what = _what(lights is not None)
     with KernelLock(CACHE_DIR) as lock:
@@ -254,12 +249,11 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
                 "first start of this version: compiling its %d kernels, or what is missing of them (a minute or two)",
                 count,
             )
-        complaint = CacheComplaint()
+        before = len(CACHE_REPORT.damaged)
 
         def missing() -> None:
             """Takes the lock when a kernel is missing despite the mark."""
             nonlocal compiled
-            complaint.log()
             lock.acquire()
             compiled = True
 
@@ -268,8 +262,8 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
             code_us = 0.0 if lights is None else _exercise_lights(lights)
         if cold:
             _mark(what)
-    damaged, unwritten = complaint.result()
-    return Warmth(compiled, time.monotonic() - begun, code_us, damaged, unwritten)
+    damaged = len(CACHE_REPORT.damaged) - before
+    return Warmth(compiled, time.monotonic() - begun, code_us, damaged, CACHE_REPORT.unwritten)
 
 
 def _mark(what: str) -> None:

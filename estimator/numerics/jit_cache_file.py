@@ -9,6 +9,7 @@ cannot be written costs time at the next start and nothing else. `CACHE_REPORT` 
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import pickle
 import shutil
@@ -21,9 +22,12 @@ from uuid import uuid4
 
 from numba.core import caching
 
+log = logging.getLogger(__name__)
+
 _upstream: Any = caching  # untyped
 _MAGIC: Final = b"LLK1"
 _DIGEST_BYTES: Final = 16
+_ROOM: Final = Path(__file__).parents[1]
 MOST_BYTES: Final = 64 << 20
 """Largest size of a file in bytes; the largest kernel has less than one percent of it."""
 
@@ -64,8 +68,17 @@ def read_checked(path: str) -> bytes | None:
 
 
 def note_damage(path: str, reason: str) -> None:
-    """Report a file as damaged; the first reason stays."""
+    """Report a file as damaged; the first reason stays. The first file is logged, whichever program reads it."""
+    if not CACHE_REPORT.damaged:
+        log.warning("%s cannot be used: %s; its kernel, and any others like it, are compiled again", path, reason)
     CACHE_REPORT.damaged.setdefault(path, reason)
+
+
+def note_unwritten(reason: str) -> None:
+    """Report that a file cannot be written; the first is logged."""
+    if not CACHE_REPORT.unwritten:
+        log.warning("%s; compiled kernels cannot be stored, each start compiles them", reason)
+    CACHE_REPORT.unwritten = reason
 
 
 def _content(path: str) -> bytes:
@@ -156,6 +169,18 @@ class _Locator(_upstream.UserProvidedCacheLocator):  # type: ignore[misc]  # unt
     def from_function(cls, py_func: Any, py_file: str) -> Any:
         return cls(py_func, py_file)
 
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        """Name of the folder; for the estimator's own files it is the same wherever they are installed."""
+        folder = Path(py_file).parent
+        if folder.is_relative_to(_ROOM):
+            return "_".join(reversed(folder.relative_to(_ROOM.parent).parts))
+        return str(super().get_suitable_cache_subpath(py_file))
+
+    def get_source_stamp(self) -> Any:
+        """Stamp of a source file; the cache directory is named by the content of the estimator's files."""
+        return "estimator" if Path(self._py_file).is_relative_to(_ROOM) else super().get_source_stamp()
+
     def ensure_cache_path(self) -> None:
         path = Path(self.get_cache_path())
         try:
@@ -192,7 +217,7 @@ class KernelCache(_upstream.FunctionCache):  # type: ignore[misc]  # untyped ups
         try:
             super()._save_overload(sig, data)
         except OSError as error:
-            CACHE_REPORT.unwritten = f"{self._cache_path}: {error.strerror or error}"
+            note_unwritten(f"{self._cache_path}: {error.strerror or error}")
 
 
 REPLACES_UPSTREAM: Final = all(

@@ -20,7 +20,6 @@ from daemon.health import journal_fields
 from tests.systemd import container, kernels
 from tests.systemd.container import Container
 from tests.systemd.pages import dead_links
-from tools.bench.vm.image import cache_name
 from tools.bench.vm.places import workspace
 
 ROOT = Path(__file__).parents[2]
@@ -66,7 +65,7 @@ def tree(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def package(folder: Path, tree: Path) -> Path:
-    """The Debian package of that tree."""
+    """The Debian package of that tree; that of the taps lies beside it."""
     out = folder / "package"
     environment = {**os.environ, "TREE": str(tree), "PYTHON": "/usr/bin/python3"}
     done = subprocess.run([ROOT / "systemd/package.sh", out], check=True, env=environment, capture_output=True)
@@ -94,9 +93,9 @@ def machine(folder: Path, package: Path, lidar: Path) -> Iterator[Container]:
     """A Debian with the package installed by its own package manager."""
     root = folder / "root"
     container.unpack(root)
-    package.rename(root / "package.deb")
-    container.inside(root, "dpkg", "-i", "/package.deb")
-    (root / "package.deb").unlink()
+    for path in package.parent.glob("*.deb"):
+        path.rename(root / path.name)
+    container.inside(root, "dpkg", "-i", f"/{package.name}")
     (root / "etc/lumiloop/lumiloop.toml").write_text(CONFIG)
     drop_in = root / "etc/systemd/system/lumiloop.service.d"
     drop_in.mkdir(parents=True)
@@ -110,19 +109,20 @@ def left_out(machine: Container, warm_kernels: None) -> list[Path]:
     """Kernels that the machine has to compile itself; it has all others."""
     from estimator.numerics.jit_cache import CACHE_DIR
 
-    return kernels.plant(CACHE_DIR, ROOT / "estimator", machine.root / CACHE, machine.root)
+    return kernels.plant(CACHE_DIR, machine.root / CACHE)
 
 
 def listing(tree: Path) -> dict[str, str]:
-    """Every file with what is in it."""
+    """Every file with what is in it, whatever the folder of the environment is called."""
     found = {}
     for path in sorted(tree.rglob("*")):
-        if path.relative_to(tree).parts[0] == "DEBIAN":
+        name = re.sub(r"^(opt/lumiloop-versions)/[^/]+/", r"\1/*/", str(path.relative_to(tree)))
+        if name.startswith(("DEBIAN/", "usr/lib/lumiloop/")) or name in ("opt/lumiloop", "opt/lumiloop-versions/.lock"):
             continue
         if path.is_symlink():
-            found[str(path.relative_to(tree))] = f"-> {path.readlink()}"
+            found[name] = f"-> {path.readlink()}"
         elif path.is_file():
-            found[str(path.relative_to(tree))] = hashlib.sha256(path.read_bytes()).hexdigest()
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found
 
 
@@ -162,9 +162,7 @@ def test_the_rest_was_found_where_an_earlier_start_would_have_left_it(machine: C
     said = machine.run("journalctl", "--no-pager", "-u", WARM_UP)
     seconds = re.search(r"kernels compiled in ([\d.]+) s", said)
     assert seconds is not None, said
-    installed = next((machine.root / "opt/lumiloop/lib").glob("python3*/site-packages/estimator"))
-    inside = Path("/", installed.relative_to(machine.root))
-    expected = {cache_name(inside / package.parent.name) for package in (ROOT / "estimator").glob("*/__init__.py")}
+    expected = {f"{package.parent.name}_estimator" for package in (ROOT / "estimator").glob("*/__init__.py")}
     places = {path.name for path in left_out[0].parents[1].iterdir() if path.is_dir()}
     assert places <= expected
     assert {path.parent.name for path in left_out} <= places
@@ -253,6 +251,28 @@ def test_the_first_start_of_a_version_compiles_everything_under_the_unit_s_restr
     machine.run("systemctl", "start", UNIT, seconds=COMPILE_S)
     machine.until(UNIT, READY_S, ActiveState="active", SubState="running")
     assert list((machine.root / CACHE).glob("kernels-*/warm-*"))  # made when all have been compiled
+
+
+def test_the_taps_come_with_their_libraries_and_stay_through_an_upgrade(machine: Container) -> None:
+    """The daemon that runs keeps its files; only an upgrade of its own package starts it anew."""
+    core = next(path.name for path in machine.root.glob("lumiloop_*.deb"))
+    taps = next(path.name for path in machine.root.glob("lumiloop-taps_*.deb"))
+    needs = ("/opt/lumiloop/bin/python", "-c", "import aiohttp, foxglove, mcap, rosbags, zenoh")
+    versions = machine.root / "opt/lumiloop-versions"
+    before = _main(machine)
+    machine.run("dpkg", "-i", f"/{taps}", seconds=300.0)
+    machine.run(*needs)
+    assert _main(machine) == before
+    assert len([path for path in versions.iterdir() if path.name[0] != "."]) == 2, "one in use, one that runs"
+    machine.run("dpkg", "-i", f"/{core}", seconds=300.0)
+    _restarted(machine, before, READY_S)
+    machine.run(*needs)
+    assert len([path for path in versions.iterdir() if path.name[0] != "."]) <= 2
+    assert machine.show(UNIT, "Result") == {"Result": "success"}
+    machine.run("dpkg", "--remove", "lumiloop-taps")
+    assert "No module named" in machine.run(*needs, check=False)
+    for path in machine.root.glob("*.deb"):
+        path.unlink()
 
 
 def test_it_stops_cleanly(machine: Container) -> None:

@@ -13,7 +13,7 @@ import pytest
 from daemon.runtime import warmup
 from daemon.system import kernel_lock
 from daemon.system.kernel_lock import KernelLock
-from estimator.numerics.jit_cache_file import CacheReport
+from estimator.numerics.jit_cache_file import CACHE_REPORT, note_unwritten
 from tests.daemon.runtime.test_warmup import LOAD, ROOT, another_compiles, kernels_copied
 from tests.daemon.support.odd_files import KINDS, planted
 
@@ -68,10 +68,9 @@ def test_a_mark_is_written_once_the_names_of_all_kernels_are_synced(
 def test_kernels_that_could_not_be_stored_leave_no_mark(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    report = CacheReport()
+    monkeypatch.setattr(CACHE_REPORT, "unwritten", "")
     monkeypatch.setattr("estimator.CACHE_DIR", tmp_path)
-    monkeypatch.setattr("estimator.CACHE_REPORT", report)
-    monkeypatch.setattr(warmup, "_exercise", lambda: setattr(report, "unwritten", "/k: No space left on device"))
+    monkeypatch.setattr(warmup, "_exercise", lambda: [note_unwritten("/k: No space left on device") for _ in "12"])
     assert warmup.load().unwritten == "/k: No space left on device"
     assert not warmup.mark_of("warm").exists()
     assert caplog.text.count("compiled kernels cannot be stored, each start compiles them") == 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import gc
-import hashlib
 import os
 import random
 import shutil
@@ -138,10 +137,8 @@ def test_a_start_whose_kernels_are_there_waits_for_nobody() -> None:
 def kernels_copied(root: Path) -> Path:
     """The kernels of this tree with their mark, below another cache root."""
     folder = root / CACHE_DIR.name
-    for package in (path.parent for path in (ROOT / "estimator").glob("*/__init__.py")):
-        name = f"{package.name}_{hashlib.sha1(str(package).encode()).hexdigest()}"  # as numba names it
-        if (CACHE_DIR / name).exists():
-            shutil.copytree(CACHE_DIR / name, folder / name)
+    for package in CACHE_DIR.glob("*_estimator"):
+        shutil.copytree(package, folder / package.name)
     shutil.copy(warmup.mark_of("warm"), folder)
     return folder
 

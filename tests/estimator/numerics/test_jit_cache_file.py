@@ -148,6 +148,15 @@ def test_a_missing_file_is_no_damage(tmp_path: Path) -> None:
     assert not CACHE_REPORT.damaged
 
 
+def test_whatever_reads_damaged_files_logs_the_first_of_them(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Also a command that trusts the mark of an earlier start."""
+    for name in ("first", "second"):
+        (tmp_path / name).write_bytes(b"")
+        read_checked(str(tmp_path / name))
+    assert [record.getMessage().partition(":")[0] for record in caplog.records] == [f"{tmp_path}/first cannot be used"]
+    assert len(CACHE_REPORT.damaged) == 2
+
+
 KERNELS = "import numpy as np\nfrom estimator.numerics.jit import kernel\n" + "\n".join(
     f'@kernel("f8(f8)")\ndef plus_{k}(x):\n    return x + {k}.0\n' for k in range(len(DAMAGES))
 )

@@ -325,17 +325,10 @@ def _furnish(root: Path) -> None:
     _do(["chroot", str(root), "systemctl", "mask", "-q", *timers, "e2scrub_reap.service"], "masking timers")
 
 
-def cache_name(folder: Path) -> str:
-    """Name of the directory in which numba keeps a source folder's kernels (`numba.core.caching`)."""
-    return f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
-
-
-def copy_kernels(compiled: Path, sources: Path, place: Path, inside: Path) -> None:
-    """Copy the kernels of every package in the folder ``sources`` to ``place``, keyed as packages of ``inside``."""
-    for package in sorted(path.parent for path in sources.glob("*/__init__.py")):
-        kept = compiled / cache_name(package)
-        if kept.exists():
-            shutil.copytree(kept, place / cache_name(inside / package.name))
+def copy_kernels(compiled: Path, place: Path) -> None:
+    """Copy the kernels of every package of the estimator; they serve wherever it is installed."""
+    for package in compiled.glob("*_estimator"):
+        shutil.copytree(package, place / package.name)
 
 
 def _compile(say: Say) -> Path:
@@ -352,16 +345,13 @@ def _compile(say: Say) -> Path:
 def plant(root: Path, compiled: Path) -> None:
     """Put the kernels that have been compiled out here where the installation looks for its own.
 
-    numba keys machine code by its source file's folder (a digest in a directory's name), signature, byte code and
-    processor; the folder is the only one of these that differs. The marks of an earlier start are left there too, so
-    that the next one need not warm up: who wants a first start takes them away.
+    The marks of an earlier start are left there too, so that the next one need not warm up: who wants a first start
+    takes them away.
     """
-    installed = next((root / "opt/lumiloop/lib").glob("python3*/site-packages/estimator"))
-    inside = f"/{installed.relative_to(root)}"
     place = root / CACHE_PLACE / compiled.name
-    copy_kernels(compiled, ROOT / "estimator", place, Path(inside))
-    mark = "from daemon.runtime import warmup; warmup.ROOM = {!r}; print(warmup.mark_of({!r}).name)"
+    copy_kernels(compiled, place)
+    mark = "from daemon.runtime import warmup; print(warmup.mark_of({!r}).name)"
     for what in ("warm", "warm-lights"):
-        named = _do([sys.executable, "-c", mark.format(inside, what)], "naming the marks", WARM)
+        named = _do([sys.executable, "-c", mark.format(what)], "naming the marks", WARM)
         (place / named.split()[-1]).touch()
     (root / CACHE_PLACE).parent.chmod(0o700)
