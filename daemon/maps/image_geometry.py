@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from daemon.maps.grid_files import finest
-from estimator import Array, Grid, Keyframe, MapImage, Submap, at_once, finished, se2
+from estimator import Array, Beam, Grid, Keyframe, MapImage, Submap, at_once, finished, se2
 
 
 def placed(image: MapImage) -> list[tuple[Keyframe, Array]]:
@@ -31,6 +31,15 @@ def pieces_of(image: MapImage) -> Iterator[tuple[Submap, list[Keyframe]]]:
 def grid_of(image: MapImage) -> Grid:
     """Occupancy grid of the map at the finest resolution that its extent permits."""
     return finest(partial(at_once, list(pieces_of(finished(image)))))
+
+
+def echoes_of(frame: Keyframe, T_map_keyframe: Array) -> Array:
+    """(n, 2) positions in the map frame where beams of a keyframe ended, m."""
+    bearing, reach, kind = frame.beams()
+    hit = (kind == Beam.HIT) & np.isfinite(reach) & (reach > 0.0)
+    x, y, yaw = se2.compose(T_map_keyframe, frame.T_base_lidar)
+    angle = bearing[hit] + yaw
+    return np.column_stack((x + reach[hit] * np.cos(angle), y + reach[hit] * np.sin(angle)))
 
 
 def lamps_of(image: MapImage) -> Array | None:
