@@ -43,7 +43,7 @@ def echoes_of(frame: Keyframe, T_map_keyframe: Array) -> Array:
 
 
 def lamps_of(image: MapImage) -> Array | None:
-    """(k, 2) positions of the lamps in m; None where the map is not in the survey frame."""
+    """(k, 3) positions of the lamps in m, and their numbers; None where the map is not in the survey frame."""
     if not image.identity.surveyed or not image.lamps:
         return None
-    return np.array([(lamp.x, lamp.y) for lamp in image.lamps])
+    return np.array([(lamp.x, lamp.y, lamp.lamp_id) for lamp in image.lamps])
