@@ -287,13 +287,13 @@ def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> 
         truth.bind(("127.0.0.1", 0))
         truth.setblocking(False)
         words = simulator_words(options, folder, odometry, truth.getsockname()[1])
-        page = stack.enter_context(web_page(config, out / PAGE_LOG))
-        if address := page_address(page, out / PAGE_LOG):
-            print(f"watch it in a browser: {address}", flush=True)
         patience = Patience(out)
         simulator = stack.enter_context(running(words, out / "simulator.log", stdout=subprocess.PIPE))
         wait_for_simulator(simulator, patience)
         daemon = stack.enter_context(running(daemon_words, out / "daemon.log", stdout=subprocess.DEVNULL))
+        page = stack.enter_context(web_page(config, out / PAGE_LOG))
+        if address := page_address(page, out / PAGE_LOG):
+            print(f"watch it in a browser: {address}", flush=True)
         reader = stack.enter_context(Reader("127.0.0.1", modbus))
         wait_for_pose(daemon, reader, patience)
         print(f"{options.building}: the robot drives off; its pose is on Modbus 127.0.0.1:{modbus} (UDP and TCP)")

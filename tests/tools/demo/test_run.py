@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -245,7 +246,8 @@ def test_half_a_minute(tmp_path: Path) -> None:
     text, _ = demo.communicate(timeout=240)
     assert demo.returncode == 0, text
     assert "TRACKING" in text
-    assert text.startswith("watch it in a browser: http://127.0.0.1:"), "before all else"
+    waiting = r"(.*: (loading|.* kernels.*)\n|a first start .*\n)*"
+    assert re.match(waiting + "watch it in a browser: http://127.0.0.1:", text), "before all else"
     figures = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert figures["ok"]
     assert figures["driven_m"] > 3.0
