@@ -124,9 +124,7 @@ def reached(free: Mask, frame: Frame, robot: Robot, drive: Drive | None = None) 
         return Reached(open_room, robot.width, regions=count)
     inside = connected
     if drive is not None and drive.echoes:
-        _, behind = _regions(free & ~_glass(free.shape, frame, drive.echoes), frame.cell, robot.width)
-        apart = _connected(behind, frame, seeds)
-        inside = apart if apart.any() else connected
+        inside = _before_glass(free, connected, frame, robot.width, seeds, drive.echoes)
     area = frame.cell**2
     return Reached(
         inside,
@@ -136,6 +134,26 @@ def reached(free: Mask, frame: Frame, robot: Robot, drive: Drive | None = None) 
         float((connected & ~_widened(inside, frame.cell, robot.width)).sum()) * area,
         count,
     )
+
+
+def _before_glass(
+    free: Mask, connected: Mask, frame: Frame, width: float, seeds: Array, echoes: Sequence[Array]
+) -> Mask:
+    """Returns the part of ``connected`` that no glass separates from the seeds.
+
+    People who walk past leave echoes too. Only echoes at the border of what is left out are obstacles.
+    """
+    glass = _glass(free.shape, frame, echoes)
+    strict = _connected(_regions(free & ~glass, frame.cell, width)[1], frame, seeds)
+    if not strict.any():
+        return connected
+    behind = connected & ~_widened(strict, frame.cell, width)
+    if not behind.any():
+        return connected
+    border = glass & (ndimage.distance_transform_edt(~behind) * frame.cell <= 2.0 * width)
+    loose = _connected(_regions(free & ~border, frame.cell, width)[1], frame, seeds)
+    leaked = (loose & behind).sum() > 0.5 * behind.sum()
+    return strict if leaked else loose
 
 
 def _regions(free: Mask, cell: float, width: float) -> tuple[Mask, npt.NDArray[np.int32]]:

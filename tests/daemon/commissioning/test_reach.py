@@ -84,6 +84,16 @@ def test_floor_behind_glass_is_left_out_and_named() -> None:
     assert "left out: 12 m2 that the lidar has seen only through glass" in said(glass)
 
 
+def test_somebody_who_walks_about_is_no_glass() -> None:
+    """Echoes in the middle of the room, from two scans: nothing behind them is left out, nor what they stand on."""
+    person = np.array([in_map(x, y) for x in np.arange(2.0, 2.6, 0.1) for y in np.arange(1.0, 1.6, 0.1)])
+    path = driven(2)
+    crowded = halls(1.0, Robot(), Drive(path.path, [*path.echoes, person, person]))
+    assert len(crowded.places) == len(halls(1.0, Robot(), path).places)
+    alone = halls(1.0, Robot(), Drive(path.path, [person, person]))
+    assert len(alone.places) == len(halls(1.0, Robot(), driven(0)).places)
+
+
 def test_a_map_file_leaves_out_where_nobody_has_driven() -> None:
     hall = halls(0.4, Robot(), driven(0))
     assert hall.places[:, 0].max() < 6.4
