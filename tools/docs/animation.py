@@ -30,7 +30,6 @@ PERIOD_S: Final = 0.1
 HOLD_S: Final = 3.0
 """The last frame stands so long."""
 TRAIL_S: Final = 14.0
-COLOURS: Final = 40
 LETTERS: Final = 64
 """Of a reason in a line."""
 ROBOT_M: Final = 0.28
@@ -41,6 +40,7 @@ PAPER: Final[Colour] = (255, 255, 255)
 QUIET: Final[Colour] = (110, 118, 130)
 LAMP: Final[Colour] = (250, 204, 21)
 UNUSED: Final[Colour] = (214, 214, 206)
+UNKNOWN: Final[Colour] = (226, 229, 234)
 GOOD, CAREFUL, SEARCHING = (0, 121, 145), (214, 128, 0), (170, 30, 110)
 """Blue-green, orange and purple: colour-blind readers distinguish them."""
 HUES: Final[dict[State, Colour]] = {
@@ -97,8 +97,8 @@ class Canvas:
         wide, high = (round(cells * ground.cell * self.scale) for cells in (columns, rows))
         self.ground, self.foot = ground, HEAD * _FINE + high
         self.image = Image.new("RGB", (wide, self.foot + FOOT * _FINE), PAPER)
-        tinted = np.stack([np.interp(ground.grey, (0, 205, 254), shades) for shades in ((28, 226, 255), (34, 229, 255),
-                          (48, 234, 255))], axis=2)  # fmt: skip
+        ramps = zip(INK, UNKNOWN, PAPER, strict=True)
+        tinted = np.stack([np.interp(ground.grey, (0, 205, 254), ramp) for ramp in ramps], axis=2)
         plan = Image.fromarray(tinted.astype(np.uint8)).resize((wide, high), Image.Resampling.NEAREST)
         self.image.paste(plan, (0, HEAD * _FINE))
         self.draw = ImageDraw.Draw(self.image)
@@ -190,13 +190,25 @@ def _words(canvas: Canvas, now: Moment, hue: Colour) -> None:
     canvas.text((right - 0.5 * bar - 12, top - 7), "1 m", 13, INK)
 
 
+def _palette() -> Image.Image:
+    """All colours, and mixtures of each with paper and of the dark ones with others, for smooth edges."""
+    pure = [INK, QUIET, LAMP, UNUSED, UNKNOWN, *dict.fromkeys(HUES.values())]
+    pairs = [(one, PAPER) for one in pure] + [(one, LAMP) for one in pure] + [(INK, UNKNOWN), (QUIET, UNUSED)]
+    shades = [PAPER, *pure, *(_mixed(one, two, share) for one, two in pairs for share in (0.25, 0.5, 0.75))]
+    made = Image.new("P", (1, 1))
+    made.putpalette([part for shade in shades for part in shade])
+    return made
+
+
+def _mixed(one: Colour, two: Colour, share: float) -> Colour:
+    red, green, blue = (round(share * a + (1.0 - share) * b) for a, b in zip(one, two, strict=True))
+    return red, green, blue
+
+
 def write(path: Path, ground: Ground, moments: Sequence[Moment]) -> int:
     """Writes the GIF, a frame a moment, which repeats for ever; returns its bytes."""
     drawn = [frame(ground, moments[: k + 1]) for k in range(len(moments))]
-    sample = Image.new("RGB", (drawn[0].width, drawn[0].height * 3))
-    for k, one in enumerate((drawn[0], drawn[len(drawn) // 2], drawn[-1])):
-        sample.paste(one, (0, k * one.height))
-    palette = sample.quantize(COLOURS, dither=Image.Dither.NONE)
+    palette = _palette()
     few = [one.quantize(palette=palette, dither=Image.Dither.NONE) for one in drawn]
     times = [round(1e3 * PERIOD_S)] * (len(few) - 1) + [round(1e3 * HOLD_S)]
     few[0].save(path, save_all=True, append_images=few[1:], duration=times, loop=0, optimize=False)

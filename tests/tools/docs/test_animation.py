@@ -59,6 +59,16 @@ def test_words_change_when_it_is_lifted_and_the_file_moves(tmp_path: Path) -> No
     assert size == (tmp_path / "a.gif").stat().st_size
 
 
+def test_the_colours_of_the_states_survive_in_the_file(tmp_path: Path) -> None:
+    states = (State.TRACKING, State.DEGRADED, State.RELOCATING, State.TRACKING)
+    write(tmp_path / "a.gif", GROUND, [moment(state, (1.0, -1.0, 0.5), float(k)) for k, state in enumerate(states)])
+    with Image.open(tmp_path / "a.gif") as picture:
+        for k, state in enumerate(states):
+            picture.seek(k)
+            shown = np.array(picture.convert("RGB").getpixel(pixel(1.0, -1.0)))
+            assert np.abs(shown - HUES[state]).max() < 6, state
+
+
 def test_the_animation_of_the_readme_is_small_and_shown() -> None:
     path = IMAGES / "kidnap.gif"
     assert path.stat().st_size <= 1_500_000
