@@ -134,6 +134,7 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--journal-at", type=float, metavar="SECONDS", help="and the first so long after the beginning")
     known = "; ".join(f"{name}: {what}" for name, what in METHODS.items())
     parser.add_argument("--method", choices=METHODS, default=LUMILOOP, help=f"{known}; default: {LUMILOOP}")
+    _margin(parser)
     config_arguments(parser)
     parser.set_defaults(body=estimating("daemon.cli.replay", "main"))
 

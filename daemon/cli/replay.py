@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from daemon.replay.log_replay import Outcome, replay
@@ -27,14 +28,14 @@ if TYPE_CHECKING:  # loaded only if matches are requested
 def main(args: argparse.Namespace) -> int:
     """Runs the command; returns the exit code."""
     if args.journal is None and args.journal_at is None:
-        return command(args, write_all, method=args.method)
+        return command(args, partial(write_all, margin_m=args.margin), method=args.method)
     from daemon.replay import match_journal
 
     try:
         wanted = match_journal.choice_of(args.journal, args.journal_at)
     except match_journal.BadChoice as error:
         return console.fail(str(error), console.USAGE)
-    return command(args, write_all, match_journal.MatchJournal(wanted), args.method)
+    return command(args, partial(write_all, margin_m=args.margin), match_journal.MatchJournal(wanted), args.method)
 
 
 def command(

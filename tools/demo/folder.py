@@ -51,7 +51,7 @@ class Wiring:
 
 def clear(out: Path) -> None:
     """Remove what an earlier demo has left there, and nothing else."""
-    for name in (RECORDING, MAPS, "replay", "map"):
+    for name in (RECORDING, MAPS, "replay"):
         shutil.rmtree(out / name, ignore_errors=True)
     for name in (CONFIG, SURVEY, MAP, PICTURE, NOTE, "summary.json"):
         (out / name).unlink(missing_ok=True)
@@ -69,22 +69,22 @@ def keep(folder: Path, out: Path, building: str) -> str:
     bus = f"unix:{out / 'i2c'}" if lit else ""
     wiring = Wiring("demo", out / "lidar", ODOMETRY_PORT, MODBUS_PORT, bus, MAPS)
     (out / CONFIG).write_text(wiring.config())
-    if wrong := _lumiloop(out, "replay", str(out / RECORDING), "--out", str(out / "replay")):
+    (out / NOTE).write_text(note(out, building, lit))
+    if not (out / RECORDING).exists():
+        return "there is no recording"
+    if wrong := _replay(out):
         return f"the recording could not be replayed: {wrong}"
-    picture = "map", "export", str(out / RECORDING), "--out", str(out / "map"), "--margin", f"{MARGIN_M:g}"
-    if wrong := _lumiloop(out, *picture):
-        return f"the map could not be exported: {wrong}"
-    shutil.copyfile(out / "map" / PICTURE, out / PICTURE)
+    shutil.copyfile(out / "replay" / PICTURE, out / PICTURE)
     if (made := out / "replay" / MAP).exists():
         shutil.copyfile(made, out / MAP)
         (out / MAPS).mkdir(exist_ok=True)
         shutil.copyfile(made, out / MAPS / MAP)
-    (out / NOTE).write_text(note(out, building, lit))
     return ""
 
 
-def _lumiloop(out: Path, *words: str) -> str:
-    command = [sys.executable, "-m", "daemon", *words, "--config", str(out / CONFIG)]
+def _replay(out: Path) -> str:
+    command = [sys.executable, "-m", "daemon", "replay", str(out / RECORDING), "--out", str(out / "replay")]
+    command += ["--margin", f"{MARGIN_M:g}", "--config", str(out / CONFIG)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     return "" if done.returncode == 0 else done.stderr.strip() or f"exit code {done.returncode}"
 

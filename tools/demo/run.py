@@ -318,8 +318,8 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
     figures = summary(score)
     early = interrupted and not score.error_m  # nothing is wrong with a run that had no time to show anything
     wrong = wrong or ("" if early else verdict(figures)) or complaint(score.acts)
-    if score.error_m or early:
-        wrong = keep(folder, out, options.building) or wrong
+    kept = keep(folder, out, options.building)
+    wrong = wrong or kept
     print("\n".join(told(figures)))
     for act in score.acts:
         print(act.words)
