@@ -83,7 +83,7 @@ def run(quick: bool, work: Work) -> Report:
         bounded("160 m with lights, loops closed: heading RMS, worst", turned, "deg", "<= 0.3", command),
     )
     table = Table("160 m, loops closed, as published live; cm, deg", HEAD, tuple(rows))
-    picture = Picture("fig5-loops", partial(draw, [done[0], done[len(seeds)]]), (9.0, 4.7))
+    picture = Picture("fig5-loops", partial(draw, [done[0], done[len(seeds)]]), (9.0, 5.3))
     return Report(figures, (table,), (picture,), tuple(seeds))
 
 
