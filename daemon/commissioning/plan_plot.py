@@ -29,6 +29,8 @@ _WORST_CM: Final = 25.0
 _MOST_LINKS: Final = 8
 _NUMBERED: Final = 200
 """With more lamps than these, numbers would hide the plan."""
+_LEFT_OUT: Final = 0.85
+"""Grey of floor that the robot does not reach."""
 _LASER, _BOTH = "#e69f00", "#0072b2"
 """Orange and blue that colour-blind readers distinguish (Okabe, Ito)."""
 
@@ -46,6 +48,7 @@ def figure(hall: Hall, plan: Plan) -> Any:
     """Returns the plot as a figure of matplotlib."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     window = _window(hall, plan)
     upright = window.height >= _LYING * window.width
@@ -67,7 +70,11 @@ def figure(hall: Hall, plan: Plan) -> Any:
         panel.set(xlabel="x, m (map frame)", ylabel="y, m (map frame)")
         panel.tick_params(labelbottom=True, labelleft=True)
     canvas.suptitle(f"{len(plan.lamps)} lamps", fontsize="large")
-    canvas.legend(*blind.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
+    lines, labels = blind.get_legend_handles_labels()
+    if hall.reached.left_out.any():
+        lines.append(Patch(color=str(_LEFT_OUT)))
+        labels.append("floor that is left out")
+    canvas.legend(lines, labels, loc="outside lower center", ncols=2, fontsize="small")
     return canvas
 
 
@@ -137,7 +144,7 @@ def _image(axes: Any, hall: Hall, value: Array, extent: tuple[float, float, floa
 
 def _walls(axes: Any, hall: Hall, window: Window) -> None:
     rows, columns = hall.solid.shape
-    shade = np.where(hall.tall, 0.0, np.where(hall.solid, 0.5, np.nan))
+    shade = np.where(hall.tall, 0.0, np.where(hall.solid, 0.5, np.where(hall.reached.left_out, _LEFT_OUT, np.nan)))
     extent = (0.0, columns * hall.cell, 0.0, rows * hall.cell)
     _image(axes, hall, shade, extent, cmap="gray", vmin=0.0, vmax=1.0)
     axes.set_xlim(window.left, window.left + window.width)

@@ -50,12 +50,14 @@ class Reached(NamedTuple):
     """Result.
 
     Attributes:
-        room: (rows, columns) where the robot's centre can be. width: m. since: "its start" or "its drives", or empty.
+        room: (rows, columns) where the robot's centre can be; left_out: where it could be, but does not get to.
+        width: m. since: from where it must get there, as text; empty: from anywhere.
         apart_m2: floor that is left out because it is not connected. behind_m2: floor that is left out because glass
             separates it. regions: number of regions that are not connected with each other.
     """
 
     room: Mask
+    left_out: Mask
     width: float
     since: str = ""
     apart_m2: float = 0.0
@@ -117,22 +119,19 @@ def reached(free: Mask, frame: Frame, robot: Robot, drive: Drive | None = None) 
         )
     count = len(np.unique(regions[open_room]))
     since, seeds = _seeds(robot, drive)
+    nothing = np.zeros_like(open_room)
     if seeds is None:
-        return Reached(open_room, robot.width, regions=count)
+        return Reached(open_room, nothing, robot.width, regions=count)
     connected = _connected(regions, frame, seeds, required=robot.start is not None)
     if not connected.any():
-        return Reached(open_room, robot.width, regions=count)
+        return Reached(open_room, nothing, robot.width, regions=count)
     inside = connected
     if drive is not None and drive.echoes:
         inside = _before_glass(free, connected, frame, robot.width, seeds, drive.echoes)
     area = frame.cell**2
+    apart, behind = open_room & ~connected, connected & ~_widened(inside, frame.cell, robot.width)
     return Reached(
-        inside,
-        robot.width,
-        since,
-        float((open_room & ~connected).sum()) * area,
-        float((connected & ~_widened(inside, frame.cell, robot.width)).sum()) * area,
-        count,
+        inside, apart | behind, robot.width, since, float(apart.sum()) * area, float(behind.sum()) * area, count
     )
 
 
