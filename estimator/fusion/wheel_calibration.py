@@ -24,8 +24,8 @@ from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.result import SlowError, SlowErrors
 
-STEP_M, STEP_RAD = 0.5, 0.5
-"""Distance (m) and turn (rad) of one step: matches are then accurate to a few per cent of it."""
+STEP_M, STEP_RAD = 1.0, 0.5
+"""Distance (m) and turn (rad) of one step: matches are then accurate to a per cent or two of it."""
 LONGEST_S: Final = 10.0
 """Longest duration (s) of a step; a robot that hardly moves shows nothing."""
 SPLIT_S: Final = 0.5
@@ -39,16 +39,16 @@ NOISE: Final = (0.012, 0.012, 0.006)
 """Sigmas (m, m, rad) of the two matches that limit a step."""
 SLIP, SLIP_TURN = 0.02, 0.02
 """Random part of wheel motion: share of distance and of turn over one step."""
-FIRST_NOISE, LEARNING = 4.0, 0.05
-"""Initial factor on these variances, and the share of one step in it."""
+FIRST_NOISE, LEARNING, FEWEST = 4.0, 0.05, 4
+"""Initial factor on these variances, the share of one step in it, and the fewest steps that show it."""
 NU: Final = 4.0
 """Degrees of freedom of the Student-t likelihood: the heavy tail of slip."""
 RECENT: Final = 20
 """Steps after which the recent errors are estimated anew."""
-CHANGED: Final = 25.7
-"""Squared Mahalanobis distance of recent errors from former ones (99.99 % of chi-square with 5 degrees of freedom).
+CHANGED: Final = 51.4
+"""Squared Mahalanobis distance of recent errors from former ones above which the errors have changed.
 
-Above it the errors have changed.
+It is twice the 99.99 % quantile of chi-square with 5 degrees of freedom: slip and stamp errors repeat.
 """
 MOST_LEARNED: Final = 16.3
 """Largest squared Mahalanobis distance (99.9 % of chi-square with 3 degrees) of which the noise is learned."""
@@ -210,7 +210,7 @@ def compare(wheels: WheelCalibration, made: Array) -> None:
         wheels.errors = wheels.former = wheels.recent
     if wheels.steps % RECENT == 0:
         wheels.former, wheels.recent = wheels.errors, Errors()
-    wheels.told = judged(wheels.errors, wheels.mount)
+    wheels.told = judged(wheels.errors, wheels.mount) if wheels.steps >= FEWEST else None
     wheels.fix = (wheels.errors.x if wheels.told is not None else of_sound_robot(wheels.errors))[:3]
 
 
