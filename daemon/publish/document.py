@@ -183,8 +183,8 @@ An answer starts 3.5 characters after its request at the earliest. The daemon dr
 {1e3 * SILENCE_S:g} ms. It carries out a request to unit 0 and does not answer it. Adapters that echo work.
 
 Let the master wait for half a second or more. A request that cannot be served within {1e3 * PATIENCE_S:g} ms, or that
-the next one overtakes, is neither carried out nor answered. So a request without an answer had no effect, or its answer was
-lost: repeat it.
+the next one overtakes, is neither carried out nor answered. So a request without an answer had no effect, or its answer
+was lost: repeat it.
 
 A reference client is `tools/clients/read_rtu.py`. To try the line from the other end:
 `mbpoll -m rtu -a 1 -b 115200 -P even -t 3 -0 -r 0 -c 64 /dev/ttyUSB0`. The same over the network:
