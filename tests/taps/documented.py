@@ -50,7 +50,7 @@ ELSEWHERE: Final = {
     r"fake-devices.md: python -m hal.fake.adc.receiver": "tests/hal/fake/adc/test_receiver_process.py",
     r"bench.md: python -m tools.bench.world lap --local": "tests/tools/bench/world/test_world.py",
     r".*: (python -m tools.experiments|make experiments)": "tests/tools/experiments",
-    r"replay.md: python -m tests.logs": "tests/logs",
+    r"data.md: python -m tests.logs": "tests/logs",
     r"README.md: make docs": "tests/tools/docs/test_site.py",
     r"replay.md: mbpoll": "tests/daemon/replay/test_recorded_process.py::test_a_dump_is_asked_for_as_the_page_says",
 }

@@ -175,7 +175,7 @@ def desk(warm_kernels: None, tmp_path_factory: pytest.TempPathFactory) -> Desk:
     shutil.rmtree(made.folder / "lumiloop" / "maps", ignore_errors=True)  # of one glance, and without lamps
     with made.running(with_light):
         until(lambda: (made.folder / "i2c").exists() and (made.folder / "lamps.toml").exists())
-        plain, recording = (one for one in to_run("sessions") if one[2:4] == ["--config", "lumiloop.toml"])
+        plain, recording = sorted((one for one in to_run("sessions") if "lumiloop.toml" in one), key=len)
         for command in (in_light, plain):
             with made.running(command):
                 until((made.folder / "run/lumiloop/lumiloop.stream").exists)
