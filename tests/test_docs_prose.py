@@ -69,7 +69,7 @@ def sentences(text: str) -> Iterator[list[str]]:
     for unit in units(text):
         plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", unit)
         plain = re.sub(r"`[^`]*`", "code", plain).replace("*", "")
-        for sentence in re.split(r"(?<=[.!?])[\"')]* +(?=[\"'(]*[A-Z0-9]|code)", plain):
+        for sentence in re.split(r"(?<=[.!?])[\"')]* +(?=[\"'(]*[A-Z0-9]|code|lumiloop)", plain):
             if words := WORD.findall(sentence):
                 yield words
 
