@@ -133,7 +133,7 @@ whole snapshot of the last cycle.
 | lamps in view | from {lights_block.BLOCK.address} |
 | bound on the position error, alert limit | from {integrity_block.BLOCK.address} |
 | all faults, uptime | from {parts_block.BLOCK.address} |
-| orders, written | from {holding.COMMAND_ADDRESS} |
+| commands, written | from {holding.COMMAND_ADDRESS} |
 
 * Addresses count from 0. Tools that count from 1 show address 0 as 30001 (function 4) or 40001.
 * The high byte comes first, and the **high word first** in 32- and 64-bit values.
@@ -277,7 +277,7 @@ def _writing() -> str:
     return f"""## Writing: holding registers
 
 Writing needs `modbus.write = true`; otherwise every write gets exception 1. Functions 6 and 16 write, function 3 reads
-back. Everybody who is answered can write. Examples: [Give orders](orders.md).
+back. Everybody who is answered can write. Examples: [Control a running daemon](control.md).
 
 ### Command block, {holding.COMMAND_ADDRESS} to {holding.COMMAND_ADDRESS + holding.COMMAND.words - 1}
 

@@ -17,7 +17,7 @@ RUN: Final = {
         r"replay.md: lumiloop run", r"start-lidar.md: lumiloop run",
     ),
     "beside": (
-        r"(start-lidar|troubleshooting|operations).md: lumiloop status", r"(start-lidar|orders).md: mbpoll",
+        r"(start-lidar|troubleshooting|operations).md: lumiloop status", r"(start-lidar|control).md: mbpoll",
         r"view.md: lumiloop view(?! drive)",
         r"formats.md: lumiloop (metrics|foxglove)", r"formats.md: curl", r"stream.md: python tools/clients",
         r"planning.md: lumiloop lamps",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import struct
 from pathlib import Path
 
 import pytest
 
 from daemon.publish import document
 from daemon.publish.modbus import registers
+from daemon.publish.modbus.holding import CommandCode
 
 DOCS = Path(__file__).parents[3] / "docs"
 
@@ -26,6 +29,18 @@ def test_every_point_is_documented_where_it_is() -> None:
         assert f"| {8 + 2 * offset} | `{point.name}` | {point.wire.name} |" in udp
     for number, mirrored in enumerate(registers.MIRROR):
         assert f"| {102 + 2 * number} | `{mirrored.name}` | float32 |" in modbus
+
+
+def test_the_words_of_set_pose_are_those_of_the_command_block() -> None:
+    """`docs/control.md` has them for mbpoll."""
+    page = (DOCS / "control.md").read_text()
+    ((x, y, yaw, told),) = re.findall(r"SET_POSE to x (\S+) m, y (\S+) m, yaw (\S+) rad \| `([\d ]+)` \|", page)
+    words = struct.pack(">8H", *map(int, told.split()))
+    request, command, *pose = struct.unpack(">HHiii", words)
+    assert (request, command) == (1, CommandCode.SET_POSE)
+    assert pose == [round(1e4 * float(x)), round(1e4 * float(y)), round(1e6 * float(yaw))]
+    for name, number in re.findall(r"^\| ([A-Z_]+)\b.*`1 (\d+)` \|$", page, re.MULTILINE):
+        assert CommandCode[name] == int(number)
 
 
 def test_writing_makes_the_pages(tmp_path: Path) -> None:
