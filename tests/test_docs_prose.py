@@ -20,7 +20,8 @@ GENERATED: Final = {"modbus.md", "udp.md", "codes.md", "commands.md", "configura
 """Their texts are those of the program."""
 NOT_USED: Final = re.compile(
     r"\b(adrift|anew|afresh|askew|astray|lasers?|witness(?:es)?|lean(?:s|ed)?|bent|hears?|heard|hung|whoever|"
-    r"twins?|says?|said|tells?|told|speaks?|carried off|lets? go|stands? still|vague|surer|unsure|leaps?|ladder|rungs?|hints?)\b",
+    r"twins?|says?|said|tells?|told|speaks?|carried off|lets? go|stands? still|vague|surer|unsure|"
+    r"leaps?|ladder|rungs?|hints?)\b",
     re.IGNORECASE,
 )
 """Of the list in docs/glossary.md, those that have no other use."""
