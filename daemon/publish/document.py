@@ -115,8 +115,8 @@ def modbus_page() -> str:
     return f"""{NOTICE}
 # Modbus registers
 
-The daemon is a Modbus server on UDP and TCP: port 1502 (`modbus.port`), on the loopback address unless `bind` says
-otherwise. With `modbus.serial` it also answers on a serial line (RTU). All show the same tables. It is not a safety
+The daemon is a Modbus server on UDP and TCP: port 1502 (`modbus.port`), on the loopback address unless `bind` is set.
+With `modbus.serial` it also answers on a serial line (RTU). All show the same tables. It is not a safety
 function.
 
 Read **{registers.BLOCK_WORDS} input registers from address 0 in one request** (function 4, or 3). The answer is one
