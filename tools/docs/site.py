@@ -11,7 +11,7 @@ LINK: Final = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)")
 
 def on_config(config: Any) -> Any:
     """Give headings the anchors that GitHub gives them, so that one link serves both."""
-    from pymdownx.slugs import slugify
+    from pymdownx.slugs import slugify  # type: ignore[import-not-found, unused-ignore]  # comes with mkdocs-material
 
     config.mdx_configs["toc"]["slugify"] = slugify(case="lower")
     return config
