@@ -92,7 +92,7 @@ def test_the_counting_is_right() -> None:
     assert sum(len(WORD.findall(line)) for line in uncoded(text)) == 14
 
 
-@pytest.mark.parametrize("page", [*PAGES, "faults.md", "glossary.md"])
+@pytest.mark.parametrize("page", [*PAGES, "faults.md", "glossary.md", "simulator.md"])
 def test_sentences_are_short(page: str) -> None:
     lengths = [(len(words), " ".join(words)) for words in sentences((DOCS / page).read_text())]
     assert [one for one in lengths if one[0] > LONGEST] == []
