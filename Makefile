@@ -120,6 +120,7 @@ docs: $(SITE)  ## regenerate the pages that come from code, and build the site: 
 	$(RUN) -m daemon.publish.document docs
 	$(RUN) -m daemon --reference > docs/configuration.md
 	$(RUN) -m tools.docs.commands > docs/commands.md
+	$(RUN) -m tools.docs.topics > docs/topics.md
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
 	@echo "open out/site/index.html"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.docs import commands
+from tools.docs import commands, topics
 from tools.docs.site import within
 
 ROOT = Path(__file__).parents[3]
@@ -18,6 +18,15 @@ ROOT = Path(__file__).parents[3]
 
 def test_the_page_of_commands_is_current() -> None:
     assert (ROOT / "docs" / "commands.md").read_text() == commands.page(), "run: make docs"
+
+
+def test_the_index_is_current_and_leads_to_headings_keys_and_registers() -> None:
+    assert (ROOT / "docs" / "topics.md").read_text() == topics.page(), "run: make docs"
+    found = {entry.word: entry for entry in topics.entries()}
+    assert found["`map_x`"].note == "register 18"
+    assert found["`integrity.alert_m`"].link == "configuration.md"
+    assert found["`lumiloop map align`"].link == "commands.md#lumiloop-map-align"
+    assert found["The flight recorder"].link == "replay.md#the-flight-recorder"
 
 
 def test_the_page_of_commands_names_each_option() -> None:
