@@ -175,7 +175,7 @@ def desk(warm_kernels: None, tmp_path_factory: pytest.TempPathFactory) -> Desk:
     shutil.rmtree(made.folder / "lumiloop" / "maps", ignore_errors=True)  # of one glance, and without lamps
     with made.running(with_light):
         until(lambda: (made.folder / "i2c").exists() and (made.folder / "lamps.toml").exists())
-        plain, recording = (one for one in to_run("sessions") if one[2:4] == ["--config", "lumiloop.toml"])
+        plain, recording = sorted((one for one in to_run("sessions") if "lumiloop.toml" in one), key=len)
         for command in (in_light, plain):
             with made.running(command):
                 until((made.folder / "run/lumiloop/lumiloop.stream").exists)
@@ -281,8 +281,8 @@ def test_of_maps(recording: Path, tmp_path: Path) -> None:
         "out/intel/map.lumimap",
     ):
         assert (tmp_path / name).stat().st_size > 0, name
-    # twice each: a name, another frame, an import; and the replay's
-    assert len(list(tmp_path.rglob("*.lumimap"))) == before + 7
+    # a name, another frame, an import; and the replay's
+    assert len(list(tmp_path.rglob("*.lumimap"))) == before + 4
 
 
 @pytest.mark.system
