@@ -45,14 +45,20 @@ ELSEWHERE: Final = {
     r".*: lumiloop probe": "tests/daemon/cli/test_probe.py",
     r"calibration.md: lumiloop (survey|calibrate)": "tests/daemon/commissioning/test_teach_drive.py",
     r".*: make install": "tests/systemd/test_container.py",
-    r"(README|start-demo).md: make demo|simulator.md: (make demo|python -m tools.demo)": "tests/tools/demo/test_run.py",
+    r"README.md: make demo|(start-demo|simulator).md: lumiloop demo|simulator.md: python -m tools.demo": (
+        "tests/tools/demo/test_run.py"
+    ),
     r"fake-devices.md: (python -m hal.fake --model|lumiloop run)": "tests/daemon/processes/test_process.py",
     r"fake-devices.md: python -m hal.fake.adc.receiver": "tests/hal/fake/adc/test_receiver_process.py",
     r"bench.md: python -m tools.bench.world lap --local": "tests/tools/bench/world/test_world.py",
     r".*: (python -m tools.experiments|make experiments)": "tests/tools/experiments",
     r"data.md: python -m tests.logs": "tests/logs",
     r"README.md: make docs": "tests/tools/docs/test_site.py",
-    r"replay.md: mbpoll": "tests/daemon/replay/test_recorded_process.py::test_a_dump_is_asked_for_as_the_page_says",
+    r"replay.md: lumiloop dump": (
+        "tests/daemon/replay/test_recorded_process.py::test_a_dump_is_asked_for_as_the_page_says"
+    ),
+    r"control.md: lumiloop": "tests/daemon/cli/orders/test_give.py",
+    r"modbus.md: mbpoll": "tests/daemon/publish/test_document.py::test_the_lines_of_mbpoll_give_every_order",
 }
 """The test that runs it, or what it is made of where the whole takes minutes, hours, or the devices of a computer."""
 
