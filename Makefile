@@ -37,8 +37,12 @@ $(STAMP): requirements/dev.lock pyproject.toml
 
 venv: $(STAMP)  ## make .venv with everything at the locked versions
 
-demo: venv  ## the daemon on a simulated robot under coded lamps; each sensor fails once; then a map picture
+demo: venv  ## the daemon on a simulated robot under coded lamps; each sensor fails once; results in out/demo
 	$(RUN) -m tools.demo $(ARGS)
+
+.PHONY: pictures
+pictures: venv  ## the README's picture and animation, from simulated drives in virtual time (a few minutes)
+	$(RUN) -m tools.docs.drives $(ARGS)
 
 check: venv  ## formatting, lint, strict types
 	$(BIN)/ruff format --check --quiet .

@@ -11,6 +11,7 @@ from estimator.commands import obey
 from estimator.fusion import (
     map_odom_filter,
     motion_model,
+    mount_correction,
     out_of_sequence,
     protection_level,
     time_offset,
@@ -79,6 +80,8 @@ def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_
     """
     result: MatchResult | None = None
     keyframe = -1
+    if mount_correction.correct(state.wheels, state.motion, state.matching, state.pose):
+        state.time_offset.forget()
     for record in in_turn(state, records):
         refusal = refused(state.matching, record) if isinstance(record, Scan) else None
         if refusal is None:
@@ -103,6 +106,7 @@ def step(state: State, records: Iterable[Record], limits: Limits, lap: Lap = no_
 
 def see_scan(state: State, scan: Scan, limits: Limits, refusal: Reason | None, lap: Lap) -> tuple[MatchResult, int]:
     """Match a scan at the pose of its own instant and re-propagate; returns the match, and a keyframe ID or -1."""
+    scan = mount_correction.remounted(state.wheels, scan)
     if refusal is not None or not out_of_sequence.late(state.motion, scan):
         return see(state, scan, limits, refusal, lap)
     ahead = out_of_sequence.go_back(state.pose, state.motion, scan)

@@ -167,6 +167,7 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     known = "; ".join(f"{name}: {what}" for name, what in METHODS.items())
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument("--method", choices=METHODS, default=LUMILOOP, help=f"{known}; default: {LUMILOOP}")
+    _margin(parser)
     config_arguments(parser)
     parser.set_defaults(body=estimating("daemon.cli.replay", "main", "log"))
 
@@ -217,6 +218,7 @@ def _map(parser: argparse.ArgumentParser) -> None:
     export.add_argument("--pgm", action="store_true", help="map.pgm, map.yaml, map.png; what is written by default")
     export.add_argument("--tum", action="store_true", help="keyframes.tum: where the keyframes of a map file lie")
     export.add_argument("--carmen", action="store_true", help="keyframes.clf: and their scans")
+    _margin(export)
     config_arguments(export)
     export.set_defaults(body=estimating("daemon.cli.maps.export", "main", "log_or_map"))
     taken = verbs.add_parser("import", help="make a map to be localised in of one of map_server's or nav2's")
@@ -230,6 +232,7 @@ def _map(parser: argparse.ArgumentParser) -> None:
     render = verbs.add_parser("render", help="draw a map file as a picture")
     render.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
     render.add_argument("out", type=Path, metavar="PNG", help="picture to write")
+    _margin(render)
     config_arguments(render)
     render.set_defaults(body=estimating("daemon.cli.maps.convert", "render", "map_file", "warm-plan"))
     _map_changes(verbs)
@@ -240,6 +243,19 @@ def _map(parser: argparse.ArgumentParser) -> None:
     verify = verbs.add_parser("verify", help="say whether map files are whole and consistent")
     verify.add_argument("maps", type=Path, nargs="+", metavar="FILE", help="map files, *.lumimap")
     verify.set_defaults(body=loaded("daemon.cli.maps.info", "verify"))
+
+
+def _margin(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--margin", type=_metres, metavar="M", help="picture: only this far around where the robot drove; default: all"
+    )
+
+
+def _metres(text: str) -> float:
+    metres = float(text)
+    if not 0.0 < metres < 1e6:
+        raise argparse.ArgumentTypeError(f"{text} m: name more than 0")
+    return metres
 
 
 def _map_changes(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

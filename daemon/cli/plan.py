@@ -18,6 +18,7 @@ from daemon.commissioning.floor import Array, Hall, NoHall, read_hall
 from daemon.commissioning.lamp_selection import Goals, Plan, choose, codes_for, plan_of
 from daemon.commissioning.laser_information import KNOWN_SIGMA_M, wall_information
 from daemon.commissioning.light_information import Fitting
+from daemon.commissioning.reach import Robot
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError, dump, read_survey
 from daemon.config.survey_schema import last_code
@@ -29,6 +30,7 @@ from estimator import Lamp, Receiver, Survey
 
 HEADROOM_M: Final = 0.2
 HIGHEST_M: Final = 30.0
+WIDEST_M: Final = 10.0
 OPEN_M: Final = 1.0
 """An axis with a larger sigma, m, counts as unknown."""
 
@@ -42,11 +44,11 @@ def main(args: argparse.Namespace) -> int:
         receiver = survey.receiver if survey is not None else _receiver(args.settings)
         height = args.height if survey is None else float(np.median([lamp.z for lamp in survey.lamps]))
         fitting = fitting_of(receiver, height)
-        hall = read_hall(args.map, args.spacing)
+        hall = read_hall(args.map, args.spacing, Robot(args.width, args.start and tuple(args.start)))
         walls = wall_information(hall, args.reach)
         goals = Goals(args.links, args.accuracy, 0.01 * args.share, exact=args.lamps)
         plan = choose(hall, fitting, walls, goals) if survey is None else plan_of(
-            hall, fitting, walls, goals, _in_plan(hall, np.array([(lamp.x, lamp.y) for lamp in survey.lamps]))
+            hall, fitting, walls, goals, hall.in_plan(np.array([(lamp.x, lamp.y) for lamp in survey.lamps]))
         )  # fmt: skip
         if args.json:
             with contextlib.redirect_stdout(sys.stderr):
@@ -70,6 +72,10 @@ def _wrong(args: argparse.Namespace) -> str:
     metres = args.accuracy, args.reach, args.spacing
     if not (all(0.0 < m < math.inf for m in metres) and 0.0 < args.share <= 100.0 and args.links >= 1):
         return "--accuracy, --reach, --spacing, --links have to be above 0 and finite, --share above 0 and at most 100"
+    if not 0.0 < args.width <= WIDEST_M:
+        return f"--width {args.width:g}: name metres above 0, {WIDEST_M:g} at most"
+    if args.start is not None and not all(math.isfinite(m) for m in args.start):
+        return "--start: name two finite numbers, metres in the map frame"
     if args.lamps is not None and args.survey is not None:
         return "--lamps says how many are to be hung, --survey judges those that hang: name one of them"
     if args.lamps is not None and args.lamps < 1:
@@ -104,13 +110,6 @@ def fitting_of(receiver: Receiver, height: float) -> Fitting:
     return Fitting(height - receiver.z, Lamp(0, 0, 0.0, 0.0, 0.0).order + receiver.order, receiver.half_fov_rad)
 
 
-def _in_plan(hall: Hall, xy: Array) -> Array:
-    x, y, yaw = hall.origin
-    c, s = math.cos(yaw), math.sin(yaw)
-    dx, dy = xy[:, 0] - x, xy[:, 1] - y
-    return np.column_stack((c * dx + s * dy, c * dy - s * dx))
-
-
 def report(hall: Hall, plan: Plan, goals: Goals, fitting: Fitting) -> str:
     """Returns the results as text."""
     area = len(hall.places) * hall.step**2
@@ -120,6 +119,7 @@ def report(hall: Hall, plan: Plan, goals: Goals, fitting: Fitting) -> str:
     fewer = ", ".join(f"{count} see {number}" for number, count in enumerate(counts[:-1]) if count)
     lines = [
         f"floor: {area:.0f} m2 where a robot can be, {len(hall.places)} places {hall.step:.2f} m apart",
+        *hall.reached.lines(hall.pictured),
         f"laser alone: a blind axis (over {100 * KNOWN_SIGMA_M:.0f} cm) at {_percent(blind)} of them",
         f"lamps: {len(plan.lamps)}, one for every {area / max(1, len(plan.lamps)):.1f} m2; each reaches "
         f"{fitting.reach:.1f} m",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from daemon.replay.log_replay import Outcome, replay
@@ -34,12 +35,13 @@ def main(args: argparse.Namespace) -> int:
             journal = match_journal.MatchJournal(match_journal.choice_of(args.journal, args.journal_at))
         except match_journal.BadChoice as error:
             return console.fail(str(error), console.USAGE)
-    return command(args, _write_and_print if args.json else write_all, journal, args.method)
+    write = partial(_write_and_print if args.json else write_all, margin_m=args.margin)
+    return command(args, write, journal, args.method)
 
 
-def _write_and_print(folder: Folder, outcome: Outcome) -> None:
+def _write_and_print(folder: Folder, outcome: Outcome, margin_m: float | None) -> None:
     """Writes every result, and prints the summary on stdout."""
-    write_all(folder, outcome)
+    write_all(folder, outcome, margin_m=margin_m)
     sys.stdout.write((folder.path / "summary.json").read_text())
 
 

@@ -184,6 +184,10 @@ def _plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--share", type=float, default=95.0, metavar="PERCENT", help="of places where both hold; 95")
     parser.add_argument("--spacing", type=float, default=0.5, metavar="M", help="between spots for lamps; 0.5")
     parser.add_argument("--reach", type=float, default=10.0, metavar="M", help="of the lidar; 10")
+    parser.add_argument("--width", type=float, default=0.6, metavar="M", help="of the robot; 0.6")
+    parser.add_argument(
+        "--start", type=float, nargs=2, metavar=("X", "Y"), help="start of the robot, m in the map frame"
+    )
     parser.add_argument("--lamps", type=int, metavar="N", help="as many, whatever is wanted")
     parser.add_argument("--survey", type=Path, metavar="FILE", help="judge these lamps instead, in the map's frame")
     parser.add_argument(

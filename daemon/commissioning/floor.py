@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from daemon.commissioning.reach import ANYWHERE, Drive, Frame, NoRoom, Reached, Robot, reached
 from daemon.maps.map_server import BadMapServer, Trinary, load
 
 Array = npt.NDArray[np.float64]
@@ -18,12 +19,8 @@ Mask = npt.NDArray[np.bool_]
 
 CELL_M: Final = 0.1
 """Cell of the plan, m; finer images are made coarser."""
-CLEARANCE_M: Final = 0.3
-"""Distance of the robot's centre from walls, m."""
 FURNITURE_M: Final = 1.5
 """Longest isolated object, m, that does not reach the ceiling: light passes over it."""
-LEAST_AREA_M2: Final = 1.0
-"""Smaller free areas, m^2, are flaws of the image."""
 MOST_PLACES: Final = 5000
 FINEST_M: Final = 0.25
 
@@ -39,8 +36,7 @@ class Hall:
     Attributes:
         origin: (x, y, yaw), m and rad. cell: m. solid: stops the lidar. tall: stops light, too.
         places: (n, 2) m in the plan's frame, positions of a robot on a grid of ``step`` m. spots: (m, 2) m, possible
-        lamp
-            positions.
+            lamp positions. reached: floor that the robot reaches. pictured: whether the plan is an image without beams.
     """
 
     origin: tuple[float, float, float]
@@ -50,24 +46,30 @@ class Hall:
     places: Array
     step: float
     spots: Array
+    reached: Reached
+    pictured: bool = True
 
     def in_map(self, xy: Array) -> Array:
         """Transforms points (n, 2), m, from the plan's frame to the map frame."""
-        x, y, yaw = self.origin
-        c, s = math.cos(yaw), math.sin(yaw)
-        return np.column_stack((x + c * xy[:, 0] - s * xy[:, 1], y + s * xy[:, 0] + c * xy[:, 1]))
+        return Frame(self.origin, self.cell).in_map(xy)
+
+    def in_plan(self, xy: Array) -> Array:
+        """Transforms points (n, 2), m, from the map frame to the plan's frame."""
+        return Frame(self.origin, self.cell).in_plan(xy)
 
 
-def read_hall(path: Path, spacing: float) -> Hall:
+def read_hall(path: Path, spacing: float, robot: Robot = ANYWHERE) -> Hall:
     """Returns the plan in an image of map_server or in a map file.
 
     ``path``: YAML file, the image beside it, or a map file. ``spacing``: between possible lamp positions, m.
+    ``robot``: who must reach the floor.
 
     Raises:
         NoHall: the plan cannot be used.
     """
     if path.suffix == ".lumimap":
-        return hall_of(*_of_map(path), spacing)
+        cells, resolution, origin, drive = _of_map(path)
+        return hall_of(cells, resolution, origin, spacing, robot, drive)
     if path.is_dir():
         raise NoHall(f"{path}: is a folder; name the picture in it, its YAML, or a map file, *.lumimap")
     if not path.exists():
@@ -79,45 +81,54 @@ def read_hall(path: Path, spacing: float) -> Hall:
         described, cells = load(yaml)
     except BadMapServer as error:
         raise NoHall(str(error)) from error
-    return hall_of(cells, described.resolution, described.origin, spacing)
+    return hall_of(cells, described.resolution, described.origin, spacing, robot)
 
 
-def _of_map(path: Path) -> tuple[Trinary, float, tuple[float, float, float]]:
+def _of_map(path: Path) -> tuple[Trinary, float, tuple[float, float, float], Drive]:
     from daemon.maps.container import BadMap
     from daemon.maps.edit import opened
     from daemon.maps.grid_files import greys
     from daemon.maps.image import image_from
-    from daemon.maps.image_geometry import grid_of
+    from daemon.maps.image_geometry import echoes_of, grid_of, placed
 
     try:
-        grid = grid_of(image_from(opened(path)))
+        image = image_from(opened(path))
+        grid = grid_of(image)
     except (BadMap, OSError) as error:
         raise NoHall(str(error)) from error
+    frames = placed(image)
+    drive = Drive(np.array([T[:2] for _, T in frames]).reshape(-1, 2), [echoes_of(frame, T) for frame, T in frames])
     grey = greys(grid)[::-1]
     cells = np.where(grey == 0, 1, np.where(grey == 254, 0, -1)).astype(np.int8)
-    return cells, grid.resolution, (float(grid.origin[0]), float(grid.origin[1]), 0.0)
+    return cells, grid.resolution, (float(grid.origin[0]), float(grid.origin[1]), 0.0), drive
 
 
-def hall_of(cells: Trinary, resolution: float, origin: tuple[float, float, float], spacing: float) -> Hall:
+def hall_of(
+    cells: Trinary,
+    resolution: float,
+    origin: tuple[float, float, float],
+    spacing: float,
+    robot: Robot = ANYWHERE,
+    drive: Drive | None = None,
+) -> Hall:
     """Returns the plan of a grid of cells (1 occupied, 0 free, -1 unknown; rows from below).
+
+    ``drive``: what a map file holds of its drives; None for an image.
 
     Raises:
         NoHall: it has no place for a robot.
     """
     solid, free, cell = _coarser(cells, resolution)
-    room = ndimage.distance_transform_edt(free) * cell > CLEARANCE_M
-    regions, _ = ndimage.label(room)
-    large = np.bincount(regions.ravel()) * cell**2 >= LEAST_AREA_M2
-    large[0] = False
-    room = large[regions]
-    if not room.any():
-        raise NoHall(
-            "no place in the plan is free enough for a robot; is the picture the right one, or `negate` wrong?"
-        )
+    try:
+        found = reached(free, Frame(origin, cell), robot, drive)
+    except NoRoom as error:
+        raise NoHall(str(error)) from error
+    room = found.room
     area = float(room.sum()) * cell**2
     step = cell * max(round(FINEST_M / cell), math.ceil(math.sqrt(area / MOST_PLACES) / cell), 1)
-    spots = _on_grid(free, cell, max(spacing, cell))
-    return Hall(origin, cell, solid, _tall(solid, cell), _on_grid(room, cell, step), step, spots)
+    above = free & (ndimage.distance_transform_edt(~room) * cell <= 0.5 * robot.width + 2.0 * cell)
+    spots = _on_grid(above, cell, max(spacing, cell))
+    return Hall(origin, cell, solid, _tall(solid, cell), _on_grid(room, cell, step), step, spots, found, drive is None)
 
 
 def _coarser(cells: Trinary, resolution: float) -> tuple[Mask, Mask, float]:

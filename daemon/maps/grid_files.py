@@ -63,10 +63,15 @@ def map_yaml(grid: Grid, image: str) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def map_files(grid: Grid, path: Array, lamps: Array | None = None) -> list[tuple[str, bytes]]:
-    """map.pgm, map.yaml and map.png by name, with ``path``, positions (n, 2 or more), and ``lamps``, (k, 2), in m."""
+def map_files(
+    grid: Grid, path: Array, lamps: Array | None = None, margin_m: float | None = None
+) -> list[tuple[str, bytes]]:
+    """map.pgm, map.yaml and map.png by name.
+
+    ``path``: (n, 2 or more) m. ``lamps``: (k, 3) positions in m and numbers. ``margin_m``: of map.png, about the path.
+    """
     return [
         ("map.pgm", pgm(grid)),
         ("map.yaml", map_yaml(grid, "map.pgm")),
-        ("map.png", encode_png(map_drawing.draw(grid, path, lamps))),
+        ("map.png", encode_png(map_drawing.picture(map_drawing.near(grid, path, margin_m), path, lamps))),
     ]

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from daemon.maps.grid_files import finest
-from estimator import Array, Grid, Keyframe, MapImage, Submap, at_once, finished, se2
+from estimator import Array, Beam, Grid, Keyframe, MapImage, Submap, at_once, finished, se2
 
 
 def placed(image: MapImage) -> list[tuple[Keyframe, Array]]:
@@ -33,8 +33,17 @@ def grid_of(image: MapImage) -> Grid:
     return finest(partial(at_once, list(pieces_of(finished(image)))))
 
 
+def echoes_of(frame: Keyframe, T_map_keyframe: Array) -> Array:
+    """(n, 2) positions in the map frame where beams of a keyframe ended, m."""
+    bearing, reach, kind = frame.beams()
+    hit = (kind == Beam.HIT) & np.isfinite(reach) & (reach > 0.0)
+    x, y, yaw = se2.compose(T_map_keyframe, frame.T_base_lidar)
+    angle = bearing[hit] + yaw
+    return np.column_stack((x + reach[hit] * np.cos(angle), y + reach[hit] * np.sin(angle)))
+
+
 def lamps_of(image: MapImage) -> Array | None:
-    """(k, 2) positions of the lamps in m; None where the map is not in the survey frame."""
+    """(k, 3) positions of the lamps in m, and their numbers; None where the map is not in the survey frame."""
     if not image.identity.surveyed or not image.lamps:
         return None
-    return np.array([(lamp.x, lamp.y) for lamp in image.lamps])
+    return np.array([(lamp.x, lamp.y, lamp.lamp_id) for lamp in image.lamps])

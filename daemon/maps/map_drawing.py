@@ -1,15 +1,19 @@
 """Map image rendering: grid dark on white, the trajectory coloured from start to end, lamps and a scale bar.
 
-Ceiling lamps are drawn as rings filled with yellow, if the map is in the survey frame.
+Ceiling lamps are drawn as rings filled with yellow, with their numbers, if the map is in the survey frame. The colours
+of the trajectory suit colour-blind readers. :func:`picture` adds axes in metres of the map frame, and a legend.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from daemon.maps.drawing.axes import Entry, framed
+from daemon.maps.drawing.font import word, write
 from estimator import Array, Grid
 
 Pixels = npt.NDArray[np.float64]
@@ -20,11 +24,11 @@ SMALLEST_SIDE: Final = 1200
 UNKNOWN: Final = np.array((205.0, 211.0, 220.0))
 FREE: Final = np.array((255.0, 255.0, 255.0))
 WALL: Final = np.array((28.0, 34.0, 48.0))
-PATH: Final = np.array(((37, 99, 235), (16, 185, 129), (245, 158, 11), (220, 38, 38)), dtype=np.float64)
-"""Path colours from start to end: blue, green, amber, red."""
+PATH: Final = np.array(((0, 90, 181), (170, 51, 119), (230, 120, 0)), dtype=np.float64)
+"""Path colours from start to end: blue, purple, orange."""
 
-START: Final = np.array((37.0, 99.0, 235.0))
-END: Final = np.array((220.0, 38.0, 38.0))
+START: Final = PATH[0]
+END: Final = PATH[-1]
 LAMP: Final = np.array((250.0, 204.0, 21.0))
 _LAMP_PX: Final = 6.0
 _RING_PX: Final = 2.0
@@ -35,14 +39,8 @@ _JUMP_TIMES: Final = 8.0
 carried there or found elsewhere."""
 _DOT_PX: Final = 7.0
 _BAR_PX: Final = 3.0
-_LETTERS: Final = {
-    "0": (" ### ", "#   #", "#   #", "#   #", "#   #", "#   #", " ### "),
-    "1": (" #", "##", " #", " #", " #", " #", " #"),
-    "5": ("#####", "#    ", "#### ", "    #", "    #", "#   #", " ### "),
-    "m": ("       ", "       ", "###### ", "#  #  #", "#  #  #", "#  #  #", "#  #  #"),
-    " ": ("  ",) * 7,
-}
-_LETTER_PX: Final = 2
+_NUMBER: Final = 2
+"""Column of a lamp's number."""
 _BAND: Final = 64
 """Rows of cells that are drawn at a time."""
 
@@ -56,7 +54,8 @@ def draw(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.
     Args:
         grid: the map.
         path: (n, 2 or more) positions in the map frame in order of time, metres; n may be 0.
-        lamps: (k, 2) positions of lamps in the map frame; those beyond the map's edge are not drawn.
+        lamps: (k, 2 or 3) positions of lamps in the map frame, and their numbers; those beyond the map's edge are not
+            drawn.
     """
     probability = grid.probability[::-1]
     if probability.size == 0:
@@ -71,8 +70,40 @@ def draw(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.
         for places, colours, radius in discs:
             _stamp(band, places - (top, 0.0), colours, radius)
         pixels[top : top + len(band)] = np.rint(band)
+    if lamps is not None and lamps.shape[1] > _NUMBER:
+        _draw_numbers(pixels, _to_pixels(grid, lamps, scale, scale * rows), lamps[:, _NUMBER])
     _draw_bar(pixels, scale / grid.resolution)
     return pixels
+
+
+def picture(grid: Grid, path: Array, lamps: Array | None = None) -> npt.NDArray[np.uint8]:
+    """The same as :func:`draw`, with axes and legend."""
+    image = draw(grid, path, lamps)
+    if grid.log_odds.size == 0:
+        return image
+    pixels_per_metre = image.shape[1] / (grid.log_odds.shape[1] * grid.resolution)
+    legend = [Entry(START, "start"), Entry(END, "end")] if len(path) else []
+    if lamps is not None and len(lamps):
+        legend.append(Entry(LAMP, "lamp with its number" if lamps.shape[1] > _NUMBER else "lamp"))
+    legend += [Entry(WALL, "wall"), Entry(FREE, "free"), Entry(UNKNOWN, "unknown")]
+    return framed(image, (float(grid.origin[0]), float(grid.origin[1])), pixels_per_metre, legend)
+
+
+def near(grid: Grid, path: Array, margin_m: float | None) -> Grid:
+    """The part of the grid no farther from a path than ``margin_m`` along x and y; all of it without a path or margin.
+
+    ``path``: (n, 2 or more) m in the map frame.
+    """
+    if margin_m is None or len(path) == 0 or grid.log_odds.size == 0:
+        return grid
+    low, high = path[:, :2].min(axis=0) - margin_m, path[:, :2].max(axis=0) + margin_m
+    size = np.array(grid.log_odds.shape[::-1])
+    first = np.clip(np.floor((low - grid.origin) / grid.resolution).astype(np.int64), 0, size)
+    last = np.clip(np.ceil((high - grid.origin) / grid.resolution).astype(np.int64), 0, size)
+    if (last <= first).any():
+        return grid
+    part = grid.log_odds[first[1] : last[1], first[0] : last[0]]
+    return replace(grid, origin=grid.origin + first * grid.resolution, log_odds=part)
 
 
 def _shade(probability: npt.NDArray[np.float32]) -> Pixels:
@@ -141,11 +172,15 @@ def _stamp(pixels: Pixels, places: Array, colours: Pixels, radius: float) -> Non
     pixels += cover[..., None] * (paint - pixels)
 
 
-def lettered(text: str) -> npt.NDArray[np.bool_]:
-    """Bitmap of a length label, (14, columns) pixels, true where there is ink; it needs no installed font."""
-    letters = [np.array([[pixel == "#" for pixel in row] for row in _LETTERS[letter]]) for letter in text]
-    word = np.concatenate([np.pad(letter, ((0, 0), (0, 1))) for letter in letters], axis=1)
-    return word.repeat(_LETTER_PX, axis=0).repeat(_LETTER_PX, axis=1)
+def _draw_numbers(pixels: npt.NDArray[np.uint8], places: Array, numbers: Array) -> None:
+    """Write the number of each lamp beside it, dark on a white rim."""
+    for (row, column), number in zip(places, numbers, strict=True):
+        ink = word(str(int(number)))
+        top, left = round(row) - ink.shape[0], round(column + _LAMP_PX + 2 * _RING_PX)
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                write(pixels, ink, top + down, left + right, FREE)
+        write(pixels, ink, top, left, WALL)
 
 
 def _draw_bar(pixels: npt.NDArray[np.uint8], pixels_per_metre: float) -> None:
@@ -158,10 +193,10 @@ def _draw_bar(pixels: npt.NDArray[np.uint8], pixels_per_metre: float) -> None:
     end = margin + round(length * pixels_per_metre)
     bottom = rows - margin
     pixels[bottom - round(_BAR_PX) : bottom, margin:end] = WALL
-    word = lettered(f"{length} m")
-    top = bottom - round(4 * _BAR_PX) - len(word)
-    if top >= 0 and margin + word.shape[1] <= columns:
-        pixels[top : top + len(word), margin : margin + word.shape[1]][word] = WALL
+    ink = word(f"{length} m")
+    top = bottom - round(4 * _BAR_PX) - len(ink)
+    if top >= 0 and margin + ink.shape[1] <= columns:
+        write(pixels, ink, top, margin, WALL)
     for tick in np.linspace(margin, end - 1, (length if length <= 10 else 10) + 1):
         column = round(float(tick))
         pixels[bottom - round(3 * _BAR_PX) : bottom, column : column + 1] = WALL

@@ -26,8 +26,11 @@ SCHEMA: Final = "lumiloop.replay/1"
 LOOPS_HEAD: Final = "stamp,counter,keyframe_new,keyframe_old,residual_m\n"
 
 
-def write_all(folder: Folder, outcome: Outcome) -> None:
-    """Writes every result that there is room for; each file appears whole or not at all."""
+def write_all(folder: Folder, outcome: Outcome, margin_m: float | None = None) -> None:
+    """Writes every result that there is room for; each file appears whole or not at all.
+
+    ``margin_m``: map.png shows only this much around the path, m; None: all.
+    """
     begun = time.perf_counter()
     ledger = outcome.rerun.ledger
     final, grid = ledger.final(), outcome.rerun.render()
@@ -36,7 +39,7 @@ def write_all(folder: Folder, outcome: Outcome) -> None:
         ("online.tum", tum(ledger.online())),
         ("loops.csv", _loops(ledger)),
         ("map.lumimap", _map(outcome)),
-        *map_files(grid, final.poses, outcome.rerun.lamps()),
+        *map_files(grid, final.poses, outcome.rerun.lamps(), margin_m),
         ("summary.json", _json(summary(outcome, grid))),
     ]
     try:

@@ -242,14 +242,14 @@ class Rerun:
         return image_of(self._state, identity)
 
     def lamps(self) -> Array | None:
-        """Returns (k, 2) surveyed lamp positions in the map frame, m.
+        """Returns (k, 3) surveyed lamp positions in the map frame, m, and their numbers.
 
         None until light has aligned the map to the survey.
         """
         result = self.cycle.result
         if result is None or self._lights is None or not result.placed:
             return None
-        return np.array([(lamp.x, lamp.y) for lamp in self._lights.survey.lamps]).reshape(-1, 2)
+        return np.array([(lamp.x, lamp.y, lamp.lamp_id) for lamp in self._lights.survey.lamps]).reshape(-1, 3)
 
     def _arrive(self, t_rx: float) -> None:
         self._clock.t_mono = max(self._clock.t_mono, t_rx)

@@ -7,7 +7,8 @@ wheels (A. Censi et al., IEEE Trans. Robotics 29, 2013). Wheels slip and matches
 likelihood. Errors can change, as when a mount is knocked: they are also estimated from recent steps alone, and these
 replace the former ones where both exclude each other.
 
-The estimated wheel errors correct the prediction (`corrected`). An error of the mount is only reported.
+The estimated wheel errors correct the prediction (`corrected`). A large error of the mount is corrected too
+(`mount_correction`).
 """
 
 from __future__ import annotations
@@ -81,6 +82,7 @@ class WheelCalibration:
         begun: instant and T_odom_base of the match that began the step.
         noise: learned factor on the variance of a step, which depends on lidar, stamps and floor.
         waiting: a match after the latest reading: instant and T_odom_base.
+        mount: correction of the lidar mount so far (x, y, yaw); ``errors`` has what remains.
         told: errors beyond what a sound robot has; None where there is none.
     """
 
@@ -97,14 +99,15 @@ class WheelCalibration:
     begun: tuple[float, Array] | None = None
     noise: float = FIRST_NOISE
     waiting: tuple[float, Array] | None = None
+    mount: Array = field(default_factory=se2.identity)
     told: SlowErrors | None = None
 
     @property
     def mount_rad(self) -> float:
-        """Largest heading error (rad) by the lidar mount, where that is large; else 0."""
+        """Largest remaining heading error (rad) by the lidar mount, where that is large; else 0."""
         if self.told is None or not self.told.large[SlowError.MOUNT_YAW]:
             return 0.0
-        return abs(self.told.value[SlowError.MOUNT_YAW]) + LARGE * self.told.sigma[SlowError.MOUNT_YAW]
+        return abs(float(self.errors.x[SlowError.MOUNT_YAW])) + LARGE * self.told.sigma[SlowError.MOUNT_YAW]
 
 
 def corrected(wheels: WheelCalibration, record: Odometry) -> Odometry:
@@ -207,7 +210,7 @@ def compare(wheels: WheelCalibration, made: Array) -> None:
         wheels.errors = wheels.former = wheels.recent
     if wheels.steps % RECENT == 0:
         wheels.former, wheels.recent = wheels.errors, Errors()
-    wheels.told = judged(wheels.errors)
+    wheels.told = judged(wheels.errors, wheels.mount)
     wheels.fix = (wheels.errors.x if wheels.told is not None else of_sound_robot(wheels.errors))[:3]
 
 
@@ -238,13 +241,14 @@ def on_mount(path: Array, x: Array) -> Array:
     return se2.between(M, se2.compose(path, M))
 
 
-def judged(errors: Errors) -> SlowErrors | None:
-    """The errors, where one is outside what a sound robot has."""
-    sigma = np.sqrt(errors.P.diagonal())
-    large = np.abs(errors.x) - LARGE * sigma > LARGE * SOUND
+def judged(errors: Errors, mount: Array) -> SlowErrors | None:
+    """The errors together with those of the mount that are corrected, where one is outside what a sound robot has."""
+    sigma, x = np.sqrt(errors.P.diagonal()), errors.x.copy()
+    x[[SlowError.MOUNT_Y, SlowError.MOUNT_YAW]] += mount[1:]
+    large = np.abs(x) - LARGE * sigma > LARGE * SOUND
     if not large.any():
         return None
-    return SlowErrors(tuple(errors.x.tolist()), tuple(sigma.tolist()), tuple(large.tolist()))
+    return SlowErrors(tuple(x.tolist()), tuple(sigma.tolist()), tuple(large.tolist()))
 
 
 def of_sound_robot(errors: Errors) -> Array:

@@ -75,7 +75,7 @@ def test_the_plans_of_the_documents(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         if words[0] == "plan":
             assert cli_parser.main(words) == console.OK, words
             ran += 1
-    assert ran == 3
+    assert ran == 4
     assert (tmp_path / "plan" / "lights.toml").exists()
 
 

@@ -2,7 +2,7 @@
 
 Each log goes through ``lumiloop replay`` in a process of its own, with every setting as shipped; what counts is what
 that process has written and used, start and reading included. Pictures go to ``out/bench`` (those of docs/maps.md are
-copies): the map as written, the trajectory in blue, where a loop was closed in red.
+copies): the map as written, the trajectory in blue, where a loop was closed in orange, axes in metres.
 
 **Thickness of walls.** Every ``EVERY``-th scan's points nearer than ``NEAR_M`` are placed by the final trajectory, each
 with the normal that its neighbours in the scan give it, turned towards the sensor. Around a point drawn at random, the
@@ -31,6 +31,7 @@ from scipy.spatial import cKDTree
 
 from daemon.config.schema import LidarConfig
 from daemon.devices.conversion import ScanBridge
+from daemon.maps.drawing.axes import Entry, framed
 from daemon.maps.png import encode_png
 from daemon.replay.sources import open_log
 from estimator.numerics import se2
@@ -57,7 +58,9 @@ _, status, used = os.wait4(os.posix_spawn(sys.argv[1], sys.argv[1:], os.environ)
 print(used.ru_utime + used.ru_stime, used.ru_maxrss)
 sys.exit(os.waitstatus_to_exitcode(status) & 0xFF)
 """
-PATH, LOOP = (70, 120, 235), (220, 38, 38)
+PATH, LOOP, KNOWN, BLANK, FILLED = (0, 90, 181), (230, 120, 0), (255, 255, 255), (205, 211, 220), (28, 34, 48)
+MARGIN_M: Final = 9.0
+"""Shown around the path; beyond are stray beams through windows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,15 +230,29 @@ def relief(across: Array, times: Array) -> float:
 def picture(out: Path, path: Path) -> None:
     """Draw what a replay has written."""
     grid, resolution, origin = read_pgm(out)
-    pixels = np.repeat((grid & 0xE0)[:, :, None], 3, axis=2)  # few shades: a small file
     stamps, poses = read_tum(out / "trajectory.tum")
+    grid, origin = about(grid, resolution, origin, poses)
+    pixels = np.select([(grid < 100)[..., None], (grid > 230)[..., None]], [FILLED, KNOWN], BLANK).astype(np.uint8)
     _mark(pixels, (poses[:, :2] - origin) / resolution, PATH, 0)
     with (out / "loops.csv").open() as file:
         closed = np.array([float(row["stamp"]) for row in csv.DictReader(file)])
     at = [int(np.abs(stamps - stamp).argmin()) for stamp in closed]
     _mark(pixels, (poses[at, :2] - origin) / resolution, LOOP, 2)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(encode_png(pixels))
+    named = (PATH, "path"), (LOOP, "loop closed"), (FILLED, "wall"), (KNOWN, "free"), (BLANK, "unknown")
+    legend = [Entry(np.array(colour, np.float64), text) for colour, text in named]
+    path.write_bytes(encode_png(framed(pixels, (float(origin[0]), float(origin[1])), 1.0 / resolution, legend)))
+
+
+def about(
+    grid: npt.NDArray[np.uint8], resolution: float, origin: Array, poses: Array
+) -> tuple[npt.NDArray[np.uint8], Array]:
+    """The part of a map (rows from the top) around a path, and its lower left corner."""
+    size = np.array(grid.shape[::-1])
+    low = np.clip(np.floor((poses[:, :2].min(axis=0) - MARGIN_M - origin) / resolution).astype(int), 0, size)
+    high = np.clip(np.ceil((poses[:, :2].max(axis=0) + MARGIN_M - origin) / resolution).astype(int), 0, size)
+    rows = len(grid)
+    return grid[rows - high[1] : rows - low[1], low[0] : high[0]], origin + low * resolution
 
 
 def _mark(pixels: npt.NDArray[np.uint8], cells: Array, colour: tuple[int, int, int], reach: int) -> None:

@@ -4,8 +4,8 @@ The simulator is one process (a lidar on a pty, a photodiode's converter on an I
 truth as datagrams), the daemon another (``lumiloop run``), its web page a third (``lumiloop view``). This process reads
 the pose and the links over Modbus, as any PLC would, and compares the pose with the truth of the same instant. On the
 way the photodiode and then the lidar are switched off and on again, or, with --kidnap, the robot is carried away; keys
-do the same at any time. At the end the map is taken from the daemon's own recording. Loopback only; nothing is left
-running.
+do the same at any time. At the end map, recording and configuration lie in a folder to go on with. Loopback only;
+nothing is left running.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import importlib.util
 import json
 import math
 import os
+import re
 import select
-import shutil
 import signal
 import socket
 import subprocess
@@ -32,32 +32,30 @@ from typing import Any, Final
 from daemon.cli.tap_parsers import demo_arguments
 from daemon.publish.modbus.client import NoAnswer, Reader, Reading
 from daemon.snapshot import State
+from estimator import CACHE_DIR
 from tools.demo.acts import ROBOT, OrderRefused, Stage, complaint, keyboard, pressed, programme
-from tools.demo.score import READY, Score, Track, cause, pose_of, summary, verdict
+from tools.demo.folder import CONFIG, KEPT, RECORDING, SURVEY, Wiring, clear, keep
+from tools.demo.score import READY, Score, Track, cause, pose_of, summary, told, verdict
 
 ROOT: Final = Path(__file__).parents[2]
 READ_PERIOD_S: Final = 0.05
 LINE_PERIOD_S: Final = 1.0
 COLD_START_S: Final = 300.0
-"""Longest wait for the first start ever, which compiles. After `TELL_S` the viewer is told."""
+"""Longest wait for the first start ever, which compiles. From `TELL_S` on the progress is shown, every `TELL_S`."""
 TELL_S: Final = 4.0
 STOP_S: Final = 10.0
+LOADING: Final = "loading"
 INTERRUPTED: Final = 130
-CONFIG: Final = "demo.toml"
 PAGE_LOG: Final = "page.log"
-RECORDING: Final = "recording"
 BUS: Final = "i2c"
-SURVEY: Final = "lamps.toml"
 CONTROL: Final = "control"
 OLD_S: Final = 1.0
 """Links that have not been told anew for so long are not shown."""
 SHOWN: Final = 4
 """Links in a line, the strongest."""
 PAGE_PORT: Final = 8090
-"""Where the web page is, if nobody else is there. After `PAGE_S` the robot drives off without it."""
-PAGE_S: Final = 5.0
-LIDAR_X: Final = 0.15
-"""Position of the lidar on the simulated robot (:class:`tools.sim.robot.drive.Body`), configured as `lidar.mount`."""
+"""Where the web page is, if nobody else is there. After `PAGE_S` the demo goes on without it."""
+PAGE_S: Final = 30.0
 
 
 class DemoError(Exception):
@@ -108,22 +106,17 @@ def free_port() -> int:
 def write_config(folder: Path, modbus: int, odometry: int, lights: bool = True) -> Path:
     """The daemon's configuration for this run; its stream is found by the name, which no other run has."""
     path = folder / CONFIG
-    text = (
-        f'name = "demo-{os.getpid()}"\nbind = "127.0.0.1"\n\n'
-        f'[lidar]\ndevice = "{folder / "lidar"}"\n\n[lidar.mount]\nx = {LIDAR_X}\n\n'
-        f'[map]\nfolder = "none"\n\n[odometry]\nport = {odometry}\n\n[modbus]\nport = {modbus}\nwrite = true\n'
-    )
-    if lights:
-        text += f'\n[photodiode]\nbus = "unix:{folder / BUS}"\n\n[lights]\nsurvey = "{SURVEY}"\n'
-    path.write_text(text)
+    bus = f"unix:{folder / BUS}" if lights else ""
+    path.write_text(Wiring(f"demo-{os.getpid()}", folder / "lidar", odometry, modbus, bus).config())
     return path
 
 
 class Patience:
-    """Waits for a child and says once, after a few seconds, that the first start takes long."""
+    """Waits for a child and shows, after a few seconds, how far the compiler is: a first start takes long."""
 
     def __init__(self, out: Path) -> None:
-        self._out, self._begin, self._told = out, time.monotonic(), False
+        self._out, self._begin, self._wall = out, time.monotonic(), time.time()
+        self._next, self._explained = TELL_S, False
 
     def wait(self, child: subprocess.Popen[str], log: str) -> None:
         """A moment.
@@ -136,13 +129,24 @@ class Patience:
             raise DemoError(f"it ended with code {child.returncode} before it was ready; read {self._out / log}")
         if waited > COLD_START_S:
             raise DemoError(f"it is not ready after {COLD_START_S:.0f} s; read {self._out / log}")
-        if waited > TELL_S and not self._told:
-            self._told = True
-            print(
-                "not ready yet: a first start compiles the numerical kernels, a minute or two; later ones take seconds",
-                flush=True,
-            )
+        if waited > self._next:
+            self._next = waited + TELL_S
+            progress = self._progress(log)
+            if progress != LOADING and not self._explained:
+                print("a first start compiles the numerical kernels, for a minute or two; later starts take seconds")
+                self._explained = True
+            print(f"{waited:5.0f} s: {progress}", flush=True)
         time.sleep(0.05)
+
+    def _progress(self, log: str) -> str:
+        """How many kernels have been compiled since the begin; the daemon says out of how many."""
+        said = re.findall(r"compiling: (\d+ of \d+ kernels)", (self._out / log).read_text(errors="replace"))
+        if said:
+            return f"the daemon has compiled {said[-1]}"
+        with contextlib.suppress(OSError):
+            if count := sum(path.stat().st_mtime >= self._wall for path in CACHE_DIR.rglob("*.nbc")):
+                return f"{count} kernels compiled so far"
+        return LOADING
 
 
 def wait_for_simulator(simulator: subprocess.Popen[str], patience: Patience) -> None:
@@ -219,12 +223,13 @@ def watch(show: Show, score: Score, seconds: float) -> None:
         now = time.monotonic()
         score.watched_s = now - begin
         score.trip_s.append(now - asked)
-        track.collect()
+        track.collect(lifted=any(act.device == ROBOT and act.state == "off" for act in show.stage.acts))
+        score.driven_m = track.driven_m
         score.take(reading, None if reading["t_mono"] is None else track.at(float(reading["t_mono"])))
         show.stage.press(pressed(), now - begin)
         off_m, jumps = (score.error_m[-1] if score.error_m else None), int(reading["jumps"] or 0)
-        for told in [*show.stage.play(now - begin, int(reading["state"] or 0), off_m, jumps), *score.news()]:
-            print(f"----- {told}", flush=True)
+        for news in [*show.stage.play(now - begin, int(reading["state"] or 0), off_m, jumps), *score.news()]:
+            print(f"----- {news}", flush=True)
         if now >= line_at:
             print(line(now - begin, score, (score.reads - reads) / (now - line_at + LINE_PERIOD_S)), flush=True)
             line_at, reads = now + LINE_PERIOD_S, score.reads
@@ -259,18 +264,6 @@ def links(reading: Reading) -> str:
     return f"{int(reading['light_used'] or 0):2d} of {int(reading['links']):2d} used  {'  '.join(shown)}"
 
 
-def export_map(folder: Path, out: Path) -> str:
-    """The map with the trajectory, from the daemon's own recording; returns what went wrong, if anything."""
-    words = [sys.executable, "-m", "daemon", "map", "export", str(folder / RECORDING), "--out", str(out / "map")]
-    words += ["--config", str(folder / CONFIG)]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        return f"the map could not be exported: {done.stderr.strip()}"
-    shutil.copyfile(out / "map" / "map.png", out / "map.png")
-    print(f"map with trajectory: {out / 'map.png'}")
-    return ""
-
-
 def simulator_words(options: argparse.Namespace, folder: Path, odometry: int, truth: int) -> list[str]:
     """The simulator's command line."""
     words = [sys.executable, "-m", "tools.sim", "--building", options.building, "--seed", str(options.seed), "--hold"]
@@ -299,11 +292,11 @@ def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> 
         wait_for_simulator(simulator, patience)
         daemon = stack.enter_context(running(daemon_words, out / "daemon.log", stdout=subprocess.DEVNULL))
         page = stack.enter_context(web_page(config, out / PAGE_LOG))
+        if address := page_address(page, out / PAGE_LOG):
+            print(f"watch it in a browser: {address}", flush=True)
         reader = stack.enter_context(Reader("127.0.0.1", modbus))
         wait_for_pose(daemon, reader, patience)
         print(f"{options.building}: the robot drives off; its pose is on Modbus 127.0.0.1:{modbus} (UDP and TCP)")
-        if address := page_address(page, out / PAGE_LOG):
-            print(f"watch it in a browser: {address}")
         if sys.stdin.isatty() and not options.dark:
             print("keys: p switches the photodiode off or on, l the lidar, c carries the robot away")
         simulator.send_signal(signal.SIGUSR1)
@@ -325,21 +318,15 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
     figures = summary(score)
     early = interrupted and not score.error_m  # nothing is wrong with a run that had no time to show anything
     wrong = wrong or ("" if early else verdict(figures)) or complaint(score.acts)
-    if score.error_m or early:
-        wrong = export_map(folder, out) or wrong
-    if score.error_m:
-        off, turned = figures["error_m"], figures["error_deg"]
-        print(
-            f"{figures['driven_m']:.1f} m driven; error median {100 * off['median']:.1f} cm, "
-            f"{turned['median']:.2f} deg; largest {100 * off['max']:.1f} cm, {turned['max']:.2f} deg; "
-            f"largest while TRACKING {100 * score.tracking_m:.1f} cm"
-        )
+    kept = keep(folder, out, options.building)
+    wrong = wrong or kept
+    print("\n".join(told(figures)))
     for act in score.acts:
         print(act.words)
         if act.device == ROBOT:
             print(f"map jumps counted: {act.jumps[0]} before, {act.jumps[1]} at the end")
     (out / "summary.json").write_text(json.dumps({"ok": not wrong, "problem": wrong, **figures}, indent=1) + "\n")
-    print(f"figures: {out / 'summary.json'}")
+    print(f"in {out}: {', '.join(name for name in KEPT if (out / name).exists())}")
     if wrong:
         print(f"FAILED: {wrong}{cause(figures)} (logs: {out})", file=sys.stderr)
     return 1 if wrong else 0
@@ -356,6 +343,7 @@ def run(options: argparse.Namespace) -> int:
     """Run the demo with these options, those of :func:`daemon.cli.tap_parsers.demo_arguments`."""
     out = options.out.absolute()
     out.mkdir(parents=True, exist_ok=True)
+    clear(out)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.default_int_handler)
     os.environ.setdefault("PYTHONUNBUFFERED", "1")

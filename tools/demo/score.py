@@ -21,6 +21,8 @@ ABSURD_M: Final = 0.5
 """Median position error beyond which the demo has failed."""
 SLOW_SHARE: Final = 0.1
 """Of the readings, from which on a slow computer is named beside what went wrong."""
+MISSED_SHARE: Final = 0.01
+"""Of the scans, from which on the summary names them."""
 GOOD: Final = (State.MAPPING, State.TRACKING)
 READY: Final = (*GOOD, State.DEGRADED, State.RELOCATING)
 """States in which the daemon follows a sensor."""
@@ -32,13 +34,18 @@ class Track:
 
     sock: socket.socket
     poses: deque[tuple[float, Pose]] = field(default_factory=lambda: deque(maxlen=400))
+    driven_m: float = 0.0
 
-    def collect(self) -> None:
-        """Take what has arrived."""
+    def collect(self, lifted: bool = False) -> None:
+        """Take what has arrived; ``lifted``: the robot is in the air, and its motion is no drive."""
         with contextlib.suppress(BlockingIOError):
             while True:
                 told = json.loads(self.sock.recv(512))
-                self.poses.append((told["t_mono"], (told["x"], told["y"], told["yaw"])))
+                pose = (told["x"], told["y"], told["yaw"])
+                if self.poses and not lifted:
+                    was = self.poses[-1][1]
+                    self.driven_m += math.hypot(pose[0] - was[0], pose[1] - was[1])
+                self.poses.append((told["t_mono"], pose))
 
     def at(self, t_mono: float) -> Pose | None:
         """The true pose at an instant, interpolated; None where it is not covered."""
@@ -64,7 +71,6 @@ class Score:
     last: Reading = field(default_factory=dict)
     driven_m: float = 0.0
     watched_s: float = 0.0
-    _was: Pose | None = None
     _told: tuple[int, int] | None = None
 
     def take(self, reading: Reading, truth: Pose | None) -> None:
@@ -90,9 +96,6 @@ class Score:
         self.error_rad.append(math.remainder(pose[2] - want[2], math.tau))
         if state == State.TRACKING.name:
             self.tracking_m = max(self.tracking_m, self.error_m[-1])
-        if self._was is not None:
-            self.driven_m += math.hypot(truth[0] - self._was[0], truth[1] - self._was[1])
-        self._was = truth
 
     def news(self) -> list[str]:
         """State and reason in words, once for each change."""
@@ -131,6 +134,26 @@ def summary(score: Score) -> dict[str, Any]:
         "modbus_round_trip_ms": 1e3 * statistics.median(score.trip_s) if score.trip_s else None,
         "modbus_unanswered": score.unanswered,
     }
+
+
+def told(figures: dict[str, Any]) -> list[str]:
+    """The summary for a person: how far the robot drove, how wrong the pose was, and whether the computer kept up."""
+    lines = [f"{figures['driven_m']:.1f} m driven in {figures['seconds']:.0f} s"]
+    if figures["error_m"] is not None:
+        off, turned = figures["error_m"], figures["error_deg"]
+        lines.append(
+            f"error of the pose: median {100 * off['median']:.1f} cm and {turned['median']:.2f} deg, "
+            f"largest {100 * off['max']:.1f} cm and {turned['max']:.2f} deg, "
+            f"largest while TRACKING {100 * figures['error_while_tracking_m']:.1f} cm"
+        )
+    sent = (figures["scan_rate_hz"] or 0.0) * figures["seconds"]
+    missed, share = figures["scans_missed"] or 0, figures["too_slow"]
+    if share > 0.0 or missed > MISSED_SHARE * sent:
+        lines.append(
+            f"the computer was too slow for {100.0 * share:.0f} % of the time, {missed} of about {sent:.0f} scans were "
+            "missed: on an idle computer the figures are better"
+        )
+    return lines
 
 
 def cause(figures: dict[str, Any]) -> str:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from daemon.cli import parser as cli_parser
 from daemon.system import console
+from tools.docs.pageshots import smaller
 
 RESOLUTION_M: Final = 0.05
 FREE, WALL, UNKNOWN = 254, 0, 205
@@ -80,6 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
         page = options.docs / "planning.md"
         page.write_text(shown(page.read_text(), told))
         shutil.copyfile(folder / "plan" / "plan.png", options.docs / "images" / "plan.png")
+        smaller(options.docs / "images" / "plan.png")
     print("\n".join(told))
     return console.OK
 

@@ -173,7 +173,7 @@ def _drawing(drawn: dict[str, Array]) -> Callable[[Any], None]:
                 (line,) = axes.plot(at, values[:-1], marker="o", label=solver.value)
                 axes.axhline(values[-1], linestyle="--", linewidth=1.0, color=line.get_color())
             axes.set(title=name, xticks=list(at), xticklabels=[_label(n) for n in FIXED], ylim=(0, None))
-            axes.set(xlabel="links (dashed: adaptive)", ylabel="median error, cm")
+            axes.set(xlabel="number of links (dashed: adaptive)", ylabel="median error, cm")
             axes.grid(alpha=0.3)
             axes.legend(fontsize="small")
 

@@ -115,10 +115,10 @@ def draw(found: dict[str, Scores], canvas: Any) -> None:
     for axes, (name, scored) in zip(panels, found.items(), strict=True):
         for measure, (true, false) in scored.items():
             axes.plot(*roc(true, false), label=f"{measure}, {area(true, false):.4f}", drawstyle="steps-post")
-        axes.set(xlim=(0.0, 1.0), ylim=(0.5, 1.01), xlabel="false matches that pass", title=name)
+        axes.set(xlim=(0.0, 1.0), ylim=(0.5, 1.01), xlabel="share of false matches that pass", title=name)
         axes.set_xscale("symlog", linthresh=0.01)
-        axes.legend(fontsize=7, loc="lower right", title="area under it")
-    panels[0].set_ylabel("true matches that pass")
+        axes.legend(fontsize=7, loc="lower right", title="measure, area under its curve")
+    panels[0].set_ylabel("share of true matches that pass")
 
 
 def run(quick: bool, work: Work) -> Report:

@@ -196,11 +196,15 @@ def draw(done: list[tuple[Case, Outcome]], figure: Any) -> None:
     for axes, (case, one) in zip(panels, done, strict=True):
         axes.plot(one.t, 100.0 * one.along, ".", ms=2, color="tab:red", label="error along the corridor")
         for sign in (-1.0, 1.0):
-            axes.plot(one.t, sign * 200.0 * one.sigma, ".", ms=1, color="tab:blue", label="2 sigma said" * (sign > 0))
-            axes.plot(one.t, sign * 200.0 * one.floor, ".", ms=1, color="black", label="2 sigma, bound" * (sign > 0))
-        axes.axhspan(-5.0, 5.0, color="0.9", zorder=0)
+            axes.plot(
+                one.t, sign * 200.0 * one.sigma, ".", ms=1, color="tab:blue", label="published 2 sigma" * (sign > 0)
+            )
+            axes.plot(
+                one.t, sign * 200.0 * one.floor, ".", ms=1, color="black", label="2 sigma, least possible" * (sign > 0)
+            )
+        axes.axhspan(-5.0, 5.0, color="0.9", zorder=0, label="5 cm")
         axes.set_title(case.name, fontsize=9)
-        axes.set_ylabel("cm")
+        axes.set_ylabel("along the corridor, cm")
         axes.set_ylim(-50.0, 50.0)
-    panels[0].legend(fontsize=8, markerscale=6)
+    panels[0].legend(fontsize=8, markerscale=6, ncols=4, loc="upper center")
     panels[-1].set_xlabel("seconds since being switched on")

@@ -115,7 +115,8 @@ def draw(tasks: list[tuple[str, int, float]], done: list[Ending], canvas: Any) -
     for axes, (name, seed, _), one in zip(grid, tasks, done, strict=False):
         T = se2.compose(one.truth[0], se2.inverse(one.pose[0]))
         lies = np.array([se2.compose(T, pose) for pose in one.pose])
-        axes.plot(*one.truth[:, :2].T, "--", lw=0.6, color="tab:gray")
-        axes.plot(*lies[:, :2].T, "-", lw=0.8, color="tab:red")
-        axes.set(aspect="equal")
+        axes.plot(*one.truth[:, :2].T, "--", lw=1.6, color="tab:blue", label="true path")
+        axes.plot(*lies[:, :2].T, "-", lw=0.8, color="tab:red", label="estimated path")
+        axes.set(aspect="equal", xlabel="x, m", ylabel="y, m")
         axes.set_title(f"{name}, seed {seed}: {one.wrong} of {one.loops} loops wrong", fontsize=8)
+    canvas.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)

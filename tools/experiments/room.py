@@ -227,6 +227,11 @@ def draw(canvas: Any, rows: Array) -> None:
     axes = canvas.subplots()
     t, way = rows[:, 0], 100.0 * np.hypot(rows[:, 1], rows[:, 2])
     axes.plot(t, way, lw=0.8, label="position error")
-    axes.plot(t, 200.0 * rows[:, 9], lw=0.8, label="two sigma")
-    axes.set(xlabel="s", ylabel="cm", ylim=(0, 30), title="Paper's room: odometry and lamps")
+    axes.plot(t, 200.0 * rows[:, 9], lw=0.8, label="published 2 sigma")
+    axes.set(
+        xlabel="time, s",
+        ylabel="position error, cm",
+        ylim=(0, 30),
+        title="The paper's room: odometry and lamps, no laser",
+    )
     axes.legend()

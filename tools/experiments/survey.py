@@ -109,9 +109,11 @@ def _row(job: tuple[int, float | None, int], table: Array) -> tuple[str | float,
 
 def _draw(canvas: Any, table: Array) -> None:
     axes = canvas.add_subplot()
-    axes.plot(table[:, 0], table[:, 1], "k+", markersize=12, label="hangs there")
-    axes.plot(table[:, 3], table[:, 4], "o", fillstyle="none", label="found there")
+    axes.plot(table[:, 0], table[:, 1], "k+", markersize=12, label="true position of a lamp")
+    axes.plot(table[:, 3], table[:, 4], "o", fillstyle="none", label="found position, and its error")
     for row in table:
-        axes.annotate(f"{100.0 * float(np.hypot(row[3] - row[0], row[4] - row[1])):.1f} cm", row[3:5], fontsize=7)
+        off = f"{100.0 * float(np.hypot(row[3] - row[0], row[4] - row[1])):.1f} cm"
+        axes.annotate(off, row[:2], (0, -12), textcoords="offset points", fontsize=7, ha="center", va="top")
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-    axes.legend(fontsize=8)
+    axes.margins(0.08)
+    canvas.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)

@@ -15,12 +15,12 @@ from daemon.maps.edit import LONGEST_NAME, Refused, called, keep, put
 from daemon.maps.grid_files import map_yaml, pgm
 from daemon.maps.image import image_from, meta_of, packed
 from daemon.maps.image_geometry import grid_of, lamps_of, placed
-from daemon.maps.map_drawing import draw
+from daemon.maps.map_drawing import near, picture
 from daemon.maps.png import encode_png
 from daemon.replay.results import Folder, OutputRefused, Trajectory, tum
 from daemon.system import console
 from daemon.system.versions import release
-from estimator import Identity, image_of_cells
+from estimator import Array, Identity, MapImage, image_of_cells
 
 
 def export(args: argparse.Namespace) -> int:
@@ -32,8 +32,8 @@ def export(args: argparse.Namespace) -> int:
         written: list[str] = []
         if args.pgm or not (args.tum or args.carmen):
             grid = grid_of(image)
-            picture = encode_png(draw(grid, np.zeros((0, 3)), lamps_of(image)))
-            files = [("map.pgm", pgm(grid)), ("map.yaml", map_yaml(grid, "map.pgm")), ("map.png", picture)]
+            drawn = encode_png(picture(near(grid, _driven(image), args.margin), np.zeros((0, 3)), lamps_of(image)))
+            files = [("map.pgm", pgm(grid)), ("map.yaml", map_yaml(grid, "map.pgm")), ("map.png", drawn)]
             folder.write_each(files)
             written += [name for name, _ in files]
         if args.tum:
@@ -54,12 +54,18 @@ def render(args: argparse.Namespace) -> int:
     """Writes an image of a map file; returns the exit code."""
     try:
         image = image_from(args.stored)
-        pixels = draw(grid_of(image), np.zeros((0, 3)), lamps_of(image))
+        part = near(grid_of(image), _driven(image), args.margin)
+        pixels = picture(part, np.zeros((0, 3)), lamps_of(image))
         Folder(args.out.parent).write(args.out.name, encode_png(pixels))
     except (BadMap, OutputRefused, OSError) as error:
         return console.fail(str(error))
     sys.stdout.write(f"{args.out}: {pixels.shape[1]} x {pixels.shape[0]} pixels\n")
     return console.OK
+
+
+def _driven(image: MapImage) -> Array:
+    """(n, 3) poses of the keyframes in the map frame."""
+    return np.array([T for _, T in placed(image)]).reshape(-1, 3)
 
 
 def take_in(args: argparse.Namespace) -> int:

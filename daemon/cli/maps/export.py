@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 
 from daemon.cli import replay
 from daemon.maps.grid_files import map_files
@@ -21,9 +22,9 @@ def main(args: argparse.Namespace) -> int:
         return console.fail(
             f"{args.log}: --tum and --carmen are of map files; `lumiloop replay` writes a log's trajectory"
         )
-    return replay.command(args, _write)
+    return replay.command(args, partial(_write, args.margin))
 
 
-def _write(folder: Folder, outcome: log_replay.Outcome) -> None:
+def _write(margin_m: float | None, folder: Folder, outcome: log_replay.Outcome) -> None:
     rerun = outcome.rerun
-    folder.write_each(map_files(rerun.render(), rerun.ledger.final().poses, rerun.lamps()))
+    folder.write_each(map_files(rerun.render(), rerun.ledger.final().poses, rerun.lamps(), margin_m))

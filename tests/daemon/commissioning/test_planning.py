@@ -280,6 +280,9 @@ def test_a_plan_that_lies_turned_in_the_map() -> None:
         (["--reach", "nan"], "have to be above 0"),
         (["--spacing", "inf"], "have to be above 0"),
         (["--survey", "none.toml"], "none.toml"),
+        (["--width", "0"], "--width 0: name metres above 0"),
+        (["--start", "nan", "0"], "two finite numbers"),
+        (["--start", "-90", "0"], "the robot does not fit there; the nearest place is"),
     ],
 )
 def test_what_cannot_be_planned_is_said(

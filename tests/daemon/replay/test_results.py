@@ -14,8 +14,9 @@ import pytest
 import yaml
 from PIL import Image
 
+from daemon.maps.drawing.font import word
 from daemon.maps.grid_files import greys, map_files, map_yaml, pgm
-from daemon.maps.map_drawing import WALL, draw, lettered
+from daemon.maps.map_drawing import LAMP, UNKNOWN, WALL, draw, near, picture
 from daemon.maps.map_server import FREE, OCCUPIED
 from daemon.maps.png import encode_png
 from daemon.replay.results import Folder, OutputRefused, Trajectory, doubt, guessed, kitti, tum
@@ -110,24 +111,23 @@ def test_png_shows_the_pixels_it_was_given() -> None:
     assert encode_png(pixels) == encode_png(pixels.copy())
 
 
-def test_the_picture_shows_walls_free_space_and_the_path(tmp_path: Path) -> None:
+def test_the_picture_shows_walls_free_space_and_the_path() -> None:
     logits = np.full((40, 60), -8.0, np.float32)
     logits[:, :20] = 0.0
     logits[0] = 8.0
     grid = Grid(np.array([0.0, 0.0]), 0.1, logits)
-    Folder(tmp_path).write_each(map_files(grid, np.array([(2.5, 1.0), (5.5, 1.0), (5.5, 3.5)])))
-    picture = np.array(Image.open(tmp_path / "map.png")).astype(int)
-    scale = picture.shape[1] // 60
-    assert picture.shape == (40 * scale, 60 * scale, 3)
+    drawn = draw(grid, np.array([(2.5, 1.0), (5.5, 1.0), (5.5, 3.5)])).astype(int)
+    scale = drawn.shape[1] // 60
+    assert drawn.shape == (40 * scale, 60 * scale, 3)
 
     def at(x: float, y: float) -> list[int]:
-        return picture[picture.shape[0] - 1 - int(y / 0.1 * scale), int(x / 0.1 * scale)].tolist()
+        return drawn[drawn.shape[0] - 1 - int(y / 0.1 * scale), int(x / 0.1 * scale)].tolist()
 
     assert min(at(3.0, 3.0)) > 250  # free
     assert max(at(5.0, 0.05)) < 60  # wall, at the bottom
     assert at(1.0, 3.0) == [205, 211, 220]  # unknown
-    assert at(2.5, 1.0) == [37, 99, 235]  # the start, blue
-    assert at(5.5, 3.5) == [220, 38, 38]  # the end, red
+    assert at(2.5, 1.0) == [0, 90, 181]  # the start, blue
+    assert at(5.5, 3.5) == [230, 120, 0]  # the end, orange
     assert max(at(4.0, 1.0)) - min(at(4.0, 1.0)) > 60  # a coloured path between
 
 
@@ -138,8 +138,58 @@ def test_the_bar_says_how_long_it_is(side_m: float, length: str) -> None:
     cells = round(side_m / 0.1)
     pixels = draw(Grid(np.zeros(2), 0.1, np.zeros((cells, cells), np.float32)), np.zeros((0, 2)))
     corner = np.all(pixels[-60:, :80] == WALL, axis=2)
-    windows = np.lib.stride_tricks.sliding_window_view(corner, (word := lettered(length)).shape)
-    assert np.all(windows == word, axis=(2, 3)).sum() == 1, "letter by letter"
+    windows = np.lib.stride_tricks.sliding_window_view(corner, (ink := word(length)).shape)
+    assert np.all(windows == ink, axis=(2, 3)).sum() == 1, "letter by letter"
+
+
+def found(pixels: np.ndarray, text: str, turned: bool = False) -> np.ndarray:
+    """(n, 2) places, row and column, where a text stands."""
+    ink = np.rot90(word(text)) if turned else word(text)
+    dark = np.all(pixels == WALL, axis=2)
+    at = np.argwhere(dark[: dark.shape[0] - ink.shape[0] + 1, : dark.shape[1] - ink.shape[1] + 1] >= 0)
+    for (row, column), inked in sorted(np.ndenumerate(ink), key=lambda dot: not dot[1]):
+        at = at[dark[at[:, 0] + row, at[:, 1] + column] == inked]
+    return at
+
+
+def test_axes_say_where_a_lamp_hangs_in_the_map() -> None:
+    """By the ticks alone: a lamp's disc is where its coordinates are on both axes; its number stands beside it."""
+    grid = Grid(np.array([-12.0, 31.0]), 0.05, np.full((160, 200), -4.0, np.float32))
+    lamps = np.array([(-8.0, 36.0, 17.0), (-5.0, 33.0, 4.0), (99.0, 99.0, 5.0)])
+    pixels = picture(grid, np.array([(-10.0, 34.0), (-4.0, 34.0)]), lamps)
+    ((_, left),), ((_, right),) = found(pixels, "-11"), found(pixels, "-3")
+    ((top, _),), ((bottom, _),) = found(pixels, "38"), found(pixels, "32")
+    half = word("-11").shape[1] - word("-3").shape[1]
+    per_metre = (right - left - 0.5 * half) / 8.0
+    assert (bottom - top) / 6.0 == pytest.approx(per_metre, abs=0.3)
+    disc = np.all(pixels == LAMP, axis=2)
+    for x, y, number in lamps[:2]:
+        column = left + 0.5 * word("-11").shape[1] + per_metre * (x + 11.0)
+        row = top + 0.5 * word("38").shape[0] + per_metre * (38.0 - y)
+        assert disc[round(row) - 3 : round(row) + 4, round(column) - 3 : round(column) + 4].all()
+        beside = pixels[round(row) - 24 : round(row) + 8, round(column) : round(column) + 40]
+        assert len(found(beside, f"{number:.0f}")) == 1
+    assert len(found(pixels, "x, m (map frame)")) == 1
+    assert len(found(pixels, "y, m (map frame)", turned=True)) == 1
+    for text in ("start", "end", "lamp with its number", "wall", "free", "unknown"):
+        assert len(found(pixels, text)) == 1
+    assert len(found(pixels, "1 m")) == 1, "the bar"
+
+
+def test_a_picture_is_cut_to_a_margin_about_the_path() -> None:
+    cells = np.full((400, 600), -4.0, np.float32)
+    cells[:, 500:] = 0.0
+    grid, path = Grid(np.array([2.0, -3.0]), 0.05, cells), np.array([(5.0, 1.0, 0.2), (8.0, 2.0, 0.0)])
+    part = near(grid, path, 1.5)
+    assert part.origin == pytest.approx((3.5, -0.5))
+    assert part.log_odds.shape == (80, 120)
+    assert near(grid, path, None) is grid
+    assert near(grid, path[:0], 1.5) is grid
+    assert near(grid, path, 100.0).log_odds.shape == grid.log_odds.shape
+    assert (
+        (picture(part, path) == UNKNOWN).all(axis=2).mean() < 0.01 < (picture(grid, path) == UNKNOWN).all(axis=2).mean()
+    )
+    assert (picture(part, path).min(axis=2) > 250).mean() > 0.5
 
 
 def test_a_picture_is_drawn_in_a_few_times_its_size() -> None:

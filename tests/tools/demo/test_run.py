@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -19,11 +20,15 @@ from typing import Any
 import pytest
 
 from daemon.cli import parser
+from daemon.config.loader import load as load_config
+from daemon.health.reasons import Reason
 from daemon.snapshot import State
 from tests.rotation import share
 from tools.demo import run
 from tools.demo.acts import Stage, complaint, programme
-from tools.demo.score import Score, Track, in_map, summary, verdict
+from tools.demo.folder import KEPT, Wiring, clear, note
+from tools.demo.run import Patience
+from tools.demo.score import Score, Track, in_map, summary, told, verdict
 
 
 def reading(state: State = State.TRACKING, pose: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Any:
@@ -50,6 +55,72 @@ def test_truth_is_interpolated_and_never_guessed() -> None:
         assert math.cos(middle[2]) == pytest.approx(-1.0)
         assert track.at(0.9) is None
         assert track.at(2.1) is None
+
+
+def test_the_way_counts_from_the_start_and_not_in_the_air() -> None:
+    datagrams = socket.AF_INET, socket.SOCK_DGRAM
+    with socket.socket(*datagrams) as sock, socket.socket(*datagrams) as to:
+        sock.bind(("127.0.0.1", 0))
+        sock.setblocking(False)
+        track = Track(sock)
+
+        def drive(xs: list[float], lifted: bool = False) -> None:
+            for x in xs:
+                datagram = json.dumps({"t_mono": x, "x": x, "y": 0.0, "yaw": 0.0}).encode()
+                to.sendto(datagram, sock.getsockname())
+            time.sleep(0.05)
+            track.collect(lifted)
+
+        drive([1.0, 1.5, 2.0])
+        drive([5.0, 9.0], lifted=True)
+        drive([9.5, 9.0])
+    assert track.driven_m == pytest.approx(2.0)
+
+
+def test_the_summary_names_the_way_and_a_slow_computer() -> None:
+    score = Score(driven_m=31.26, watched_s=60.0)
+    for k in range(10):
+        score.take({**reading(), "reason": int(Reason.OVERLOADED) if k < 3 else 0}, (0.05, 0.0, 0.0))
+    assert told(summary(score))[0] == "31.3 m driven in 60 s"
+    assert "the computer was too slow for 30 % of the time" in told(summary(score))[-1]
+    score.slow = 0
+    assert "too slow" not in " ".join(told(summary(score)))
+    score.last["missed"] = 400
+    assert "400 of about 2400 scans were missed" in told(summary(score))[-1]
+    assert len(told(summary(Score(driven_m=1.0, watched_s=2.0)))) == 1
+
+
+def test_the_progress_of_the_first_compilation_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "daemon.log"
+    log.write_text("starting\n")
+    with subprocess.Popen(["sleep", "60"], text=True) as child:
+        monkeypatch.setattr("tools.demo.run.CACHE_DIR", tmp_path)
+        patience = Patience(tmp_path)
+        patience.wait(child, log.name)
+        assert capsys.readouterr().out == ""
+        now = time.monotonic()
+        monkeypatch.setattr("tools.demo.run.time.monotonic", lambda: now + 9.0)
+        patience.wait(child, log.name)
+        assert capsys.readouterr().out == "    9 s: loading\n"
+        log.write_text("compiling: 41 of 97 kernels after 5 s\ncompiling: 58 of 97 kernels after 10 s\n")
+        monkeypatch.setattr("tools.demo.run.time.monotonic", lambda: now + 14.0)
+        patience.wait(child, log.name)
+        first, second = capsys.readouterr().out.splitlines()
+        assert "a first start compiles the numerical kernels" in first
+        assert second == "   14 s: the daemon has compiled 58 of 97 kernels"
+        child.kill()
+
+
+def test_the_folder_has_a_good_configuration_and_is_cleared(tmp_path: Path) -> None:
+    (tmp_path / "demo.toml").write_text(Wiring("demo", tmp_path / "lidar", 5601, 1502, "", "maps").config())
+    assert load_config(tmp_path / "demo.toml").odometry.port == 5601
+    (tmp_path / "recording").mkdir()
+    (tmp_path / "mine.txt").touch()
+    assert "lumiloop run --config" in note(tmp_path, "paper_room", lit=True)
+    clear(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.parametrize(
@@ -188,7 +259,8 @@ def test_half_a_minute(tmp_path: Path) -> None:
     text, _ = demo.communicate(timeout=240)
     assert demo.returncode == 0, text
     assert "TRACKING" in text
-    assert "watch it in a browser: http://127.0.0.1:" in text
+    waiting = r"(.*: (loading|.* kernels.*)\n|a first start .*\n)*"
+    assert re.match(waiting + "watch it in a browser: http://127.0.0.1:", text), "before all else"
     figures = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert figures["ok"]
     assert figures["driven_m"] > 3.0
@@ -196,6 +268,11 @@ def test_half_a_minute(tmp_path: Path) -> None:
     assert figures["scan_rate_hz"] == pytest.approx(39.9, abs=0.5)
     assert figures["modbus_reads_per_s"] > 5.0
     assert (tmp_path / "out" / "map.png").read_bytes().startswith(b"\x89PNG")
+    for name in KEPT:
+        assert (tmp_path / "out" / name).exists(), name
+    settings = load_config(tmp_path / "out" / "demo.toml")
+    assert (tmp_path / "out" / settings.lights.survey).exists()
+    assert list(Path(settings.map.folder).glob("*.lumimap"))
     assert left_behind(str(tmp_path)) == []
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 

@@ -26,14 +26,19 @@ def stanford(found: Summary, canvas: Any, alert_m: float) -> None:
     axes = canvas.subplots()
     counts, _, _ = np.histogram2d(error, bound, bins=(edges, edges))
     mesh = axes.pcolormesh(edges, edges, np.where(counts > 0, counts, np.nan).T, norm=LogNorm(), cmap="viridis")
-    axes.plot((LEAST_M, MOST_M), (LEAST_M, MOST_M), "k-", lw=1.0)
-    axes.axhline(alert_m, color="tab:red", lw=1.0)
+    axes.plot((LEAST_M, MOST_M), (LEAST_M, MOST_M), "k-", lw=1.0, label="error = protection level")
+    axes.axhline(alert_m, color="tab:red", lw=1.0, label=f"alert limit, {alert_m:g} m")
     axes.axvline(alert_m, color="tab:red", lw=1.0, ls=":")
-    axes.text(1.15 * LEAST_M, 1.1 * alert_m, f"alert limit {alert_m:g} m", color="tab:red", fontsize=8)
+    axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 0.06))
     beyond = int((error > bound).sum())
     axes.text(
-        0.97, 0.03, f"misleading: {beyond} of {len(error)} cycles", transform=axes.transAxes, ha="right", fontsize=8
+        0.97,
+        0.03,
+        f"right of the diagonal (misleading): {beyond} of {len(error)} cycles",
+        transform=axes.transAxes,
+        ha="right",
+        fontsize=8,
     )
     axes.set(xscale="log", yscale="log", xlabel="horizontal error, m", ylabel="protection level, m")
     axes.set_title(f"{len(found.found)} scenarios", fontsize=9)
-    canvas.colorbar(mesh, label="cycles", ax=axes)
+    canvas.colorbar(mesh, label="number of cycles", ax=axes)

@@ -167,7 +167,7 @@ def run(quick: bool, work: Work) -> Report:
     return Report(tuple(figures), tuple(tables), tuple(pictures), tuple(seeds), NOTES)
 
 
-SIZES: Final = {"room": (9.0, 6.2), "tour": (9.0, 7.0)}
+SIZES: Final = {"room": (9.0, 7.3), "tour": (7.5, 13.0)}
 HEAD: Final = (
     "", "rmse, median", "worst", "largest, median", "worst", "at the end, median", "worst", "heading rms, median",
     "fitted rmse, median", "as kept, median",

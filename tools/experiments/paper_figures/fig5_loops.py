@@ -18,7 +18,7 @@ from estimator.mapping.keyframe import points_of_frame
 from estimator.numerics import se2
 from estimator.pipeline import Settings, keyframe_poses, new_state
 from tools.ci.figures import bounded
-from tools.experiments.paper_figures.fig5_picture import VIEWS, walls
+from tools.experiments.paper_figures.fig5_picture import POINTS, POSE, TRUTH, VIEWS, name_axes, name_lines, walls
 from tools.experiments.paper_figures.fig6_curves import right
 from tools.experiments.paper_figures.fig6_trial import FROM_S, LASER, LIT, Watcher
 from tools.experiments.support.loop_drives import SIGMA_M, play, room_drive, scans
@@ -83,22 +83,27 @@ def run(quick: bool, work: Work) -> Report:
         bounded("160 m with lights, loops closed: heading RMS, worst", turned, "deg", "<= 0.3", command),
     )
     table = Table("160 m, loops closed, as published live; cm, deg", HEAD, tuple(rows))
-    picture = Picture("fig5-loops", partial(draw, [done[0], done[len(seeds)]]), (9.0, 4.7))
+    picture = Picture("fig5-loops", partial(draw, [done[0], done[len(seeds)]]), (9.0, 5.3))
     return Report(figures, (table,), (picture,), tuple(seeds))
 
 
 HEAD: Final = ("", "rmse", "largest", "at the end", "heading rms", "keyframes at the end, rmse", "loops", "wrong")
 
 
+CLOSED: Final = {"ls": "-", "lw": 0.4, "color": "tab:green", "label": "closed loop"}
+
+
 def draw(done: list[Ending], canvas: Any) -> None:
     """Both maps with their loops."""
     for axes, one in zip(canvas.subplots(1, len(done)), done, strict=True):
         walls(axes, False)
-        axes.plot(*one.points.T, ls="", marker=",", color="black", alpha=0.5)
-        axes.plot(*one.track.truth[:, :2].T, "--", lw=0.6, color="tab:gray")
-        axes.plot(*one.track.pose[:, :2].T, "-", lw=0.8, color="tab:red")
+        axes.plot(*one.points.T, **POINTS)
+        axes.plot(*one.track.truth[:, :2].T, **TRUTH)
+        axes.plot(*one.track.pose[:, :2].T, **POSE)
         for a, b in one.loops:
-            axes.plot((a[0], b[0]), (a[1], b[1]), "-", lw=0.4, color="tab:green")
+            axes.plot((a[0], b[0]), (a[1], b[1]), **CLOSED)
+        name_axes(axes)
         left, right_, bottom, top = VIEWS["room"]
         axes.set(xlim=(left, right_), ylim=(bottom, top), aspect="equal")
         axes.set_title(f"{one.name}: RMSE {100.0 * one.live.rmse:.1f} cm, {len(one.loops)} loops", fontsize=8)
+    name_lines(canvas, 5, CLOSED)

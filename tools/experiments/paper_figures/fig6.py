@@ -172,22 +172,22 @@ def draw(drives: list[Drive], canvas: Any) -> None:
         points = curve(drives, steps, True)
         axes[0].plot(*xy(points), "o-", ms=3, lw=1.0, color=shades[steps - 1], label=words)
     points = curve(drives, LASER_STEPS, False)
-    axes[0].plot(*xy(points), "s--", ms=3, lw=1.0, color="tab:red", label="laser alone, 4")
-    axes[0].set_title("SSE threshold and number of conditions", fontsize=9)
+    axes[0].plot(*xy(points), "s--", ms=3, lw=1.0, color="tab:red", label="laser alone, conditions 1 to 4")
+    axes[0].set_title("no prior pose: threshold of SSE varies", fontsize=9)
     for lit, steps, how, name in (
         (True, LIGHT_STEPS, "o-", "with lights"),
         (False, LASER_STEPS, "s--", "laser alone (branch and bound)"),
     ):
-        axes[1].plot(*xy(shares(drives, steps, lit)), how, ms=3, lw=1.0, label=f"no idea, {name}")
+        axes[1].plot(*xy(shares(drives, steps, lit)), how, ms=3, lw=1.0, label=f"no prior pose, {name}")
     for name, mark in ((LIT, "*"), (LASER, "x")):
         p = of_way(drives, name)
         axes[1].plot([p.recall], [p.precision], mark, ms=9, label=f"as driven, {name}")
-    axes[1].set_title("share of beams that fit; as driven", fontsize=9)
+    axes[1].set_title("threshold of the share of beams that fit varies; as driven", fontsize=9)
     for one in axes:
-        one.set(xlabel="recall", xlim=(0.0, 1.02))
+        one.set(xlabel="recall (1 = all)", xlim=(0.0, 1.02))
         one.grid(alpha=0.3)
         one.legend(fontsize=6, loc="lower left")
-    axes[0].set(ylabel="precision", ylim=(0.0, 1.02))
+    axes[0].set(ylabel="precision (1 = no wrong loop)", ylim=(0.0, 1.02))
 
 
 def xy(points: list[Point]) -> tuple[list[float], list[float]]:

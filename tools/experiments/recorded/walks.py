@@ -215,7 +215,9 @@ def draw(canvas: Any, traces: dict[str, Array]) -> None:
     axes = canvas.subplots(1, len(traces), squeeze=False)[0]
     for one, (name, rows) in zip(axes, traces.items(), strict=True):
         some = rows[rows[:, 6] > 0.0]
-        one.plot(rows[:, 3], rows[:, 4], "k-", lw=0.8, label="truth")
-        one.plot(some[:, 1], some[:, 2], "r.-", lw=0.5, ms=3, label="estimate")
+        one.plot(rows[:, 3], rows[:, 4], "k-", lw=0.8, label="true path")
+        one.plot(some[:, 1], some[:, 2], "r.-", lw=0.5, ms=3, label="estimated path, one fix a second")
         one.set_title(name, fontsize=7)
-        one.set_aspect("equal")
+        one.set(aspect="equal", xlabel="x, m")
+    axes[0].set_ylabel("y, m")
+    canvas.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)

@@ -138,6 +138,10 @@ def test_a_picture(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     with Image.open(tmp_path / "hall.png") as picture:
         dark = (np.array(picture).sum(axis=2) < 300).mean()
     assert 0.005 < dark < 0.2
+    assert run("render", file, tmp_path / "part.png", "--margin", "1") == console.OK
+    assert "lumiloop: " not in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        run("render", file, tmp_path / "part.png", "--margin", "0")
 
 
 def test_what_we_export_we_import(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
