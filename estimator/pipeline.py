@@ -139,8 +139,9 @@ def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
         state.map.graph.loosen(more, state.pose.T_odom_anchor)
     guide(state.light, state.motion, match)
     time_offset.on_match(state.time_offset, scan, match)
-    complete = match.ok and bool(match.known_axes.all()) and loose_direction(match.information) is None
-    wheel_calibration.on_match(state.wheels, state.motion.t_mono, state.motion.T_odom_base, complete)
+    if state.settings.calibrate:
+        complete = match.ok and bool(match.known_axes.all()) and loose_direction(match.information) is None
+        wheel_calibration.on_match(state.wheels, state.motion.t_mono, state.motion.T_odom_base, complete)
 
 
 def extends_map(state: State, points: ScanPoints, match: MatchResult) -> bool:

@@ -43,6 +43,7 @@ class Settings(MappingSettings):
         match: the scan matcher.
         newest_only: it matches with the newest keyframe alone. A keyframe is then created only a whole step away from
             the previous one, because its error stays for good.
+        calibrate: errors of wheels and lidar mount are estimated and corrected.
         light_pose: returns the light solution of a keyframe, where it is not that of the pipeline's own light filter;
             None where there is no such solution.
         map: of the local map.
@@ -54,6 +55,7 @@ class Settings(MappingSettings):
     quality: float = 0.0
     match: ScanMatcher = scan_matcher.match
     newest_only: bool = False
+    calibrate: bool = True
     light_pose: Callable[[], Virtual | None] | None = None
     map: MapSettings = field(default_factory=MapSettings)
     matching: MatchSettings = field(default_factory=MatchSettings)

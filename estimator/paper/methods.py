@@ -74,7 +74,7 @@ class PipelineMethod:
 
 def pic(settings: Settings, lights: LightsSetup | None) -> Method:
     """The paper's baseline: pIC on the newest keyframe, without light."""
-    return PipelineMethod(replace(settings, match=Pic(settings.far_m), newest_only=True), None)
+    return PipelineMethod(replace(settings, match=Pic(settings.far_m), newest_only=True, calibrate=False), None)
 
 
 class PaperMethod:
@@ -92,7 +92,7 @@ class PaperMethod:
         self.lit = lights is not None
         self.matcher = PointToPoint(settings.far_m, first=self._first)
         self.aligned = False
-        printed = replace(settings, match=self.matcher, newest_only=True, light_pose=self._virtual)
+        printed = replace(settings, match=self.matcher, newest_only=True, calibrate=False, light_pose=self._virtual)
         self.state = pipeline.new_state(printed)
         self._before: tuple[float, Array] | None = None
 

@@ -197,7 +197,8 @@ def test_odometry_with_a_wrong_scale_is_not_called_tracking() -> None:
         await bench.until(State.TRACKING, 6.0)
         await bench.send_odometry(12.0, scale=2.5)
         assert (bench.last.state, bench.last.reason) == (State.DEGRADED, Reason.WITNESSES_DISAGREE)
-        assert bench.last.fault == Fault.ODOMETRY_DISAGREES
+        assert bench.last.condition is not None
+        assert bench.last.condition.faults == (Fault.ODOMETRY_SCALE, Fault.ODOMETRY_DISAGREES)
 
     run_daemon(scenario)
 
