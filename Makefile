@@ -10,6 +10,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.dev-stamp
 PEERS  := $(VENV)/.bench-stamp
+SITE   := $(VENV)/.docs-stamp
 RUN    := $(BIN)/python -W default
 
 .DEFAULT_GOAL := help
@@ -128,9 +129,17 @@ arm: venv  ## kernels and decoder for 64-bit ARM under qemu: the same numbers? (
 experiments: venv  ## every figure and table of the paper and ours into docs/results (recordings: LUMILOOP_DATA)
 	$(RUN) -m tools.experiments $(ARGS)
 
-docs: venv  ## regenerate the documents that come from code
+$(SITE): $(STAMP) requirements/docs.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/docs.lock
+	@touch $@
+
+docs: $(SITE)  ## regenerate the pages that come from code, and build the site: out/site/index.html
 	$(RUN) -m daemon.publish.document docs
 	$(RUN) -m daemon --reference > docs/configuration.md
+	$(RUN) -m tools.docs.commands > docs/commands.md
+	$(RUN) -m tools.docs.topics > docs/topics.md
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
+	@echo "open out/site/index.html"
 
 install:  ## into /opt/lumiloop with its units, rules and example configuration (root; DESTDIR=, PREFIX=, PYTHON=)
 	systemd/install.sh install
@@ -147,6 +156,7 @@ lock:  ## renew the lock files (needs uv)
 	$(COMPILE) pyproject.toml -o requirements/core.lock
 	$(COMPILE) --allow-unsafe $(EXTRAS) --group dev pyproject.toml -o requirements/dev.lock
 	$(COMPILE) --allow-unsafe $(EXTRAS) --group dev --group bench pyproject.toml -o requirements/bench.lock
+	$(COMPILE) -c requirements/dev.lock --group docs -o requirements/docs.lock
 
 clean:  ## remove what the targets above made
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

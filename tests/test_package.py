@@ -53,6 +53,18 @@ def test_locks_have_everything_that_is_named() -> None:
         assert not missing, f"{lock}.lock lacks {missing}"
 
 
+def test_the_lock_of_the_site_goes_with_that_of_the_tools() -> None:
+    """Both are installed into one environment."""
+
+    def versions(lock: str) -> dict[str, str]:
+        rows = (ROOT / f"requirements/{lock}.lock").read_text().splitlines()
+        return {name_of(row): re.split("[ ;]", row.partition("==")[2])[0] for row in rows if "==" in row}
+
+    site, dev = versions("docs"), versions("dev")
+    assert {name_of(one) for one in PROJECT["dependency-groups"]["docs"]} <= set(site)
+    assert {name for name in site.keys() & dev if site[name] != dev[name]} == set()
+
+
 def test_locks_name_the_extras_that_packages_ask_for() -> None:
     """Else pip takes the newest version for the extra, and refuses it for want of a hash, once there is a newer one."""
     rows = [row for row in (ROOT / "requirements/dev.lock").read_text().splitlines() if "==" in row]

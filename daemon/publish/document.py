@@ -1,4 +1,4 @@
-"""Generator of `docs/modbus.md` and `docs/udp.md` from the tables: `python -m daemon.publish.document [FOLDER]`."""
+"""Generator of `codes.md`, `modbus.md` and `udp.md` from the tables: `python -m daemon.publish.document [FOLDER]`."""
 
 from __future__ import annotations
 
@@ -37,8 +37,19 @@ def _meaning_rows(meanings: Mapping[Any, tuple[str, str]]) -> list[tuple[str, ..
     return [(str(int(number)), text, remedy) for number, (text, remedy) in meanings.items()]
 
 
-def _codes() -> str:
-    return f"""## States
+def codes_page() -> str:
+    """The text of `docs/codes.md`."""
+    return f"""{NOTICE}
+# States, reasons, faults
+
+`state`, `reason` and `fault` have the same numbers in Modbus, datagrams, the local stream and the log. A number never
+changes its meaning and is never used again. `lumiloop explain fault 302` prints the same text.
+
+The state says what the pose is worth. The reason says why the state is not better. A fault is a defect of a device, of
+its data or of the program; several can be present at once. What you see of each fault, and how soon:
+[measured](faults.md).
+
+## States
 
 {table(("number", "state", "meaning"), _state_rows())}
 
@@ -49,8 +60,11 @@ def _codes() -> str:
 ## Faults
 
 {table(("number", "fault", "what to do"), _meaning_rows(FAULTS))}
+"""
 
-## Bits of `flags`
+
+def _bits() -> str:
+    return f"""## Bits of `flags`
 
 {table(("bit", "name", "set when"), bit_rows(registers.FLAGS))}
 
@@ -99,24 +113,38 @@ def modbus_page() -> str:
         (str(last), "`seq_end`", "uint32", "", "The same as `seq`."),
     ]  # fmt: skip
     return f"""{NOTICE}
-# Modbus
+# Modbus registers
 
-The daemon is a Modbus server on UDP and TCP, port 1502 unless `modbus.port` says otherwise, on the loopback address
-unless `bind` does, and on a serial line (RTU) where `modbus.serial` names one. All three show the same tables. Read
-**{registers.BLOCK_WORDS} input registers from address 0 in one request** (function 4; function 3 shows the same): the
-answer is one snapshot, whole, of the last cycle. It is not a safety function.
+The daemon is a Modbus server on UDP and TCP: port 1502 (`modbus.port`), on the loopback address unless `bind` is set.
+With `modbus.serial` it also answers on a serial line (RTU). All show the same tables. It is not a safety function.
 
+Read **{registers.BLOCK_WORDS} input registers from address 0 in one request** (function 4, or 3). The answer is one
+whole snapshot of the last cycle.
+
+| You need | Input registers |
+| --- | --- |
+| state, reason, gravest fault, `flags` | 4 to 7 |
+| heartbeat | 8 |
+| position and heading in the map | 18 to 23; as float32: {_mirrored("map_x", "map_yaw")} |
+| the same, predicted to the time of sending | 24 to 29; as float32: {_mirrored("predicted_x", "predicted_yaw")} |
+| sigma of the pose | 36 to 38; as float32: {_mirrored("sigma_x", "sigma_yaw")} |
+| identity of the map | 46 |
+| lamps in view | from {lights_block.BLOCK.address} |
+| bound on the position error, alert limit | from {integrity_block.BLOCK.address} |
+| all faults, uptime | from {parts_block.BLOCK.address} |
+| commands, written | from {holding.COMMAND_ADDRESS} |
+
+* Addresses count from 0. Tools that count from 1 show address 0 as 30001 (function 4) or 40001.
+* The high byte comes first, and the **high word first** in 32- and 64-bit values.
+* On UDP and TCP the daemon answers any unit identifier, on a serial line only its own.
+* Over UDP one datagram is one request. Repeat it when no answer comes.
 * Function 43 with MEI type 14 (read device identification) names program, version and, as user application name, the
   robot: regular objects 0 to 6, by stream or each alone.
-* Addresses are the protocol's, from 0. Tools that count from 1 call the first register 30001 (function 4) or 40001.
-* Big-endian: high byte first within a register, **high word first** in 32- and 64-bit values.
-* On UDP and TCP any unit identifier is answered, on a serial line only ours. Over UDP, one datagram is one request;
-  repeat it when no answer comes.
-* A register map never changes under the same `version`. Check `magic` and `version` once.
-* In two requests you may see two snapshots: compare `seq` with `seq_end`.
-* Modbus has no password: keep the port on a network you trust. `allow` names the addresses and networks that are
-  answered; this computer always is.
-* Watch `heartbeat`: if it stands still, the daemon's cycle does. Use the pose only in a `state` your machine accepts.
+* Check `magic` and `version` once. A register map never changes under the same `version`.
+* Two requests may see two snapshots: compare `seq` with `seq_end`.
+* Modbus has no password. Keep the port on a network you trust. `allow` names the addresses and networks that the daemon
+  answers; it always answers this computer.
+* Watch `heartbeat`: it stops when the daemon's cycle stops. Use the pose only in a `state` that your machine accepts.
 
 {NOT_KNOWN}
 
@@ -124,10 +152,12 @@ answer is one snapshot, whole, of the last cycle. It is not a safety function.
 
 {table(("address", "name", "type", "step", "not known", "meaning"), block)}
 
-{_codes()}
+`state`, `reason` and `fault`: [States, reasons, faults](codes.md).
+
+{_bits()}
 ## Float mirror: input registers {first} to {last + 1}
 
-The scaled values again as IEEE 754 float32 in SI units, and the full covariance of the map pose. NaN: not known.
+The same values as IEEE 754 float32 in SI units, and the full covariance of the map pose. NaN means not known.
 
 {table(("address", "name", "type", "unit", "meaning"), mirror)}
 
@@ -146,19 +176,20 @@ The scaled values again as IEEE 754 float32 in SI units, and the full covariance
 def _serial() -> str:
     return f"""## Serial line (RTU)
 
-`modbus.serial = "/dev/ttyUSB1@115200#1"`: the line, its rate, our unit. Without a rate it is 19200 bit/s; characters
-are 8 bits, even parity, one stop bit unless a format follows the rate (`@9600,8N1`; 8E1, 8O1, 8N1, 8N2); a
-pseudo-terminal (socat, a gateway's) takes 8N1 alone. An answer goes out 3.5 characters after its request at the
-earliest; a request that pauses for more than {1e3 * SILENCE_S:g} ms is given up. What is sent to unit 0 is carried out
-and not answered. Adapters that echo are fine.
+`modbus.serial = "/dev/ttyUSB1@115200#1"` names the line, its rate and the daemon's unit. The default rate is 19200
+bit/s. Characters have 8 bits, even parity and one stop bit. Another format follows the rate: `@9600,8N1` (8E1, 8O1,
+8N1, 8N2). A pseudo-terminal (socat, a gateway) takes 8N1 only.
 
-Let the master wait for half a second or more. A request that this computer had no time for within {1e3 * PATIENCE_S:g}
-ms, or that the master's next one has overtaken, is neither carried out nor answered: the answer would collide with the
-next request. So a request without an answer has done nothing, or its answer was lost; ask again.
+An answer starts 3.5 characters after its request at the earliest. The daemon drops a request that pauses for more than
+{1e3 * SILENCE_S:g} ms. It carries out a request to unit 0 and does not answer it. Adapters that echo work.
 
-A reference client is `tools/clients/read_rtu.py`. Try it with
-`mbpoll -m rtu -a 1 -b 115200 -P even -t 3 -0 -r 0 -c 64 /dev/ttyUSB0` from the other end, and with
-`mbpoll -m tcp -p 1502 -t 3 -0 -r 0 -c 64 HOST` over the network.
+Let the master wait for half a second or more. A request that cannot be served within {1e3 * PATIENCE_S:g} ms, or that
+the next one overtakes, is neither carried out nor answered. So a request without an answer had no effect, or its answer
+was lost: repeat it.
+
+A reference client is `tools/clients/read_rtu.py`. To try the line from the other end:
+`mbpoll -m rtu -a 1 -b 115200 -P even -t 3 -0 -r 0 -c 64 /dev/ttyUSB0`. The same over the network:
+`mbpoll -m tcp -p 1502 -t 3 -0 -r 0 -c 64 HOST`.
 """
 
 
@@ -171,9 +202,9 @@ def _lights() -> str:
     words, links = block.registers, LISTED_LINKS
     return f"""## Lights: input registers {first} to {last}
 
-The lamps in view, strongest first, and the position from lights alone, which the laser never touches. Read
-**{words} registers from address {first} in one request**. There are {links} links, the strongest first; link k
-begins at {start} + {width} (k - 1), and the table shows the first.
+The lamps in view and the position from light alone, which never depends on the lidar. Read **{words} registers from
+address {first} in one request**. There are {links} links, the strongest first. Link k
+begins at {start} + {width} (k - 1); the table shows the first.
 
 {_whole(block, [*head, *one])}
 
@@ -187,8 +218,8 @@ def _integrity() -> str:
     first, last = _span(block := integrity_block.BLOCK)
     return f"""## Integrity: input registers {first} to {last}
 
-How far the pose can be trusted; what a protection level is, and at which risk it holds, says
-[Integrity](integrity.md). Read **{block.registers} registers from address {first} in one request**.
+How far the pose can be trusted. [Integrity](integrity.md) defines the protection level and its risk. Read
+**{block.registers} registers from address {first} in one request**.
 
 {_whole(block)}
 
@@ -202,9 +233,9 @@ def _pulse() -> str:
     first, last = _span(block := timing_block.BLOCK)
     return f"""## The cycle: input registers {first} to {last}
 
-What the daemon leaves out where the computer is too slow, how long the stages of a cycle take, and when it stood still.
-Medians and the like are those of the last half minute to minute. Read **{block.registers} registers from address
-{first} in one request**.
+What the daemon leaves out on a slow computer, how long each stage of a cycle takes, and when cycles stopped
+([the cycle](cycle.md)). Medians and percentiles cover the last half minute to minute. Read **{block.registers}
+registers from address {first} in one request**.
 
 {_whole(block)}
 """
@@ -214,9 +245,8 @@ def _parts() -> str:
     first, last = _span(block := parts_block.BLOCK)
     return f"""## The parts: input registers {first} to {last}
 
-Every fault that is present, not the gravest alone, what had to be restarted since the start, and for how long the
-daemon runs: an uptime that begins anew tells of a restart. Read **{block.registers} registers from address {first}
-in one request**. Faults are looked for once a second.
+All present faults, the restarts of each part, and the uptime. An uptime that begins again shows a restart. Read
+**{block.registers} registers from address {first} in one request**. The daemon looks for faults once a second.
 
 {_whole(block)}
 
@@ -226,6 +256,13 @@ in one request**. Faults are looked for once a second.
 
 def _thread_rows() -> list[tuple[str, ...]]:
     return [(str(thread.value), thread.name, f"{text}.") for thread, text in parts_block.THREADS.items()]
+
+
+def _mirrored(first: str, last: str) -> str:
+    """Addresses of some values in the float mirror."""
+    names = [point.name for point in registers.MIRROR]
+    begin = registers.MIRROR_ADDRESS + 2
+    return f"{begin + 2 * names.index(first)} to {begin + 2 * names.index(last) + 1}"
 
 
 def _capital(text: str) -> str:
@@ -240,40 +277,40 @@ def _writing() -> str:
     head = ("address", "name", "type", "access", "step", "not known", "meaning")
     return f"""## Writing: holding registers
 
-Only with `modbus.write = true`; otherwise every write is answered with exception 1. Functions 6, 16 and 23; function 3
-reads back. Function 23 writes first and then reads any of the tables; where either is impossible, nothing is written.
-Whoever is answered can write.
+Writing needs `modbus.write = true`; otherwise every write gets exception 1. Functions 6, 16 and 23 write, function 3
+reads back. Function 23 writes first, then reads any of the tables; where either is impossible, it writes nothing.
+Everybody who is answered can write. Examples: [Control a running daemon](control.md).
 
 ### Command block, {holding.COMMAND_ADDRESS} to {holding.COMMAND_ADDRESS + holding.COMMAND.words - 1}
 
-Write `command` and its parameters, and a new number into `request` (all in one request, or `request` last). The
-command is finished when `acknowledge` equals that number; `result` says how it ended. Writing a request again does
-nothing, so a repeated UDP datagram does no harm; a newer request replaces one that is still running. A client for it
-is `tools/clients/send_command.py`.
+Write `command`, its parameters, and a new number into `request`: all in one request, or `request` last. The command is
+finished when `acknowledge` equals that number. `result` then tells how it ended. The same number again does nothing, so
+a repeated UDP datagram does no harm. A newer request replaces one that still runs. A reference client is
+`tools/clients/send_command.py`.
 
 {table(("`command`", "name", "what happens"), _command_rows())}
 
 {table(head, holding_rows(holding.COMMAND, holding.COMMAND_ADDRESS))}
 
-`lumiloop set-pose`, `relocalise`, `save-map`, `switch-map`, `pause`, `resume` and `dump` give these orders, wait for
-the result and print it: on the robot itself without `modbus.write` (see [the local stream](stream.md#orders)), from
-elsewhere with `--host HOST[:PORT]`. With `mbpoll` each is one line, with `-0`: addresses from 0, as on this page. The
-first of the two last numbers is the request's: a new one each time.
+`lumiloop set-pose` and its like write these registers and wait for the result ([control](control.md)). With `mbpoll`
+each command is one line. `-0` counts addresses from 0, as this page does. The first of the two last numbers is the
+request number: use a new one each time.
 
 {order_lines()}
 
 ### Loop acknowledge, {holding.LOOP_ADDRESS}
 
-The bit `loop_latched` of `flags` is set from a loop closure until somebody writes the `loop_counter` of it here, so
-that a program that reads seldom misses none. There is one latch for all; several programs compare `loop_counter` each
-for itself.
+The bit `loop_latched` of `flags` stays set from a loop closure until a client writes its `loop_counter` here. So a
+client that reads seldom misses none. All clients share one latch: where there are several, each compares
+`loop_counter` itself.
 
 {table(head, holding_rows(holding.LOOP, holding.LOOP_ADDRESS))}
 
 ### Odometry input, {holding.ODOMETRY_ADDRESS} to {holding.ODOMETRY_ADDRESS + holding.ODOMETRY.words - 1}
 
-All {holding.ODOMETRY.words} registers in one request (function 16), at a steady rate of 10 per second or more. Over UDP
-the reading's time is the kernel's time of arrival less `age`; over TCP and on a serial line it is that of reading.
+Write all {holding.ODOMETRY.words} registers in one request (function 16), ten times a second or more. Over UDP the time
+of the reading is the kernel's time of arrival less `age`. Over TCP and on a serial line it is the time when the daemon
+reads it.
 
 {table(head, holding_rows(holding.ODOMETRY, holding.ODOMETRY_ADDRESS))}
 """
@@ -303,7 +340,7 @@ def _limits() -> str:
 
 def pages() -> dict[str, str]:
     """File name and text of every page."""
-    return {"modbus.md": modbus_page(), "udp.md": udp_page()}
+    return {"codes.md": codes_page(), "modbus.md": modbus_page(), "udp.md": udp_page()}
 
 
 def write(folder: Path) -> None:
@@ -316,7 +353,7 @@ def write(folder: Path) -> None:
 def main() -> None:
     """Command-line entry point."""
     parser = argparse.ArgumentParser(
-        prog="python -m daemon.publish.document", description=f"Write {' and '.join(pages())} from the daemon's tables."
+        prog="python -m daemon.publish.document", description=f"Write {', '.join(pages())} from the daemon's tables."
     )
     parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="where to; docs, unless given")
     write(parser.parse_args().folder)

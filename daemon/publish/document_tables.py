@@ -12,9 +12,9 @@ from daemon.publish.modbus.points import Layout, Point, Rule
 NOTICE: Final = (
     "<!-- Written by `python -m daemon.publish.document`; edit the tables in daemon/publish, not this file. -->"
 )
-NOT_KNOWN: Final = """A value that is not known reads as all ones (unsigned) or as the smallest number (signed), as
-SunSpec's "not implemented"; the column says where that can happen. Measurements saturate and never wrap. Counters wrap:
-take differences, modulo their width."""
+NOT_KNOWN: Final = """A value that is *not known* reads as all ones (unsigned) or as the smallest number (signed), as in
+SunSpec. The column shows where this can happen. Measurements saturate and never wrap. Counters wrap: take differences
+modulo their width."""
 
 
 def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
@@ -38,10 +38,20 @@ def _describe(point: Point) -> str:
     return f"{point.label[0].upper()}{point.label[1:]}. {point.text}{wraps}".strip()
 
 
-def layout_rows(layout: Layout, start: int, step: int) -> list[tuple[str, ...]]:
-    """Rows of a layout; `start` and `step` convert a word offset to a register address or a byte."""
+def layout_rows(layout: Layout, start: int, step: int, notes: bool = True) -> list[tuple[str, ...]]:
+    """Rows of a layout; `start` and `step` convert a word offset to a register address or a byte.
+
+    Without `notes` a row has the name of the value only.
+    """
     return [
-        (str(start + step * offset), f"`{p.name}`", p.wire.name, _step(p), _not_known(p), _describe(p))
+        (
+            str(start + step * offset),
+            f"`{p.name}`",
+            p.wire.name,
+            _step(p),
+            _not_known(p),
+            _describe(p) if notes else f"{p.label[0].upper()}{p.label[1:]}.",
+        )
         for offset, p in zip(layout.offsets, layout.points, strict=True)
     ]
 

@@ -19,75 +19,79 @@ def udp_page() -> str:
         ("0", "`magic`", "4 bytes", "", "", f'"{registers.DATAGRAM_MAGIC.decode()}".'),
         ("4", "`version`", "uint16", "", "", f"{registers.VERSION}."),
         ("6", "`length`", "uint16", "", "", f"Bytes of the whole datagram, {registers.DATAGRAM_SIZE} or more; "
-         f"{registers.SMALLEST_DATAGRAM} from programs that knew no lights, which sent no more than `devices`; "
-         f"{registers.TRUST_OFFSET + 4} from those that sent no more than `light_age`."),
-        *layout_rows(registers.BODY, registers.BODY_OFFSET, 2),
-        *layout_rows(lights_block.TAIL, registers.TAIL_OFFSET, 2),
-        *layout_rows(integrity_block.TAIL, registers.TRUST_OFFSET, 2),
+         f"{registers.SMALLEST_DATAGRAM}: ends with `devices`; {registers.TRUST_OFFSET + 4}: ends with `light_age`."),
+        *layout_rows(registers.BODY, registers.BODY_OFFSET, 2, notes=False),
+        *layout_rows(lights_block.TAIL, registers.TAIL_OFFSET, 2, notes=False),
+        *layout_rows(integrity_block.TAIL, registers.TRUST_OFFSET, 2, notes=False),
         ("length - 4", "`crc`", "uint32", "", "", f"CRC-32 of all bytes before it (at {crc} in this version)."),
     ]  # fmt: skip
     return f"""{NOTICE}
-# UDP
+# Datagrams
 
 ## Pose datagrams
 
-After each cycle the daemon sends one datagram to every `pose.receivers` entry: a computer (`192.168.0.20:5600`), a
-multicast group (`239.255.0.7:5600`), or whoever subscribes (`*:5601`, see below). Datagrams to a group stay on the
-local network. They leave by the interface whose address `bind` is, so with 127.0.0.1 they stay on this computer; with
-0.0.0.0 or `::` by the one that the system's routes name; an IPv6 group may name its own (`[ff15::42%eth0]:5600`). The
-loopback interface has no IPv6 groups. Little-endian, every value naturally aligned, CRC-32 as in zlib and
-IEEE 802.3. Nothing is repeated: a lost datagram is followed by a newer one. Readers go by `length`: a
-later version of the program may append values under the same `version` number. A reference reader in C is
-`tools/clients/listen_pose.c`.
+After each cycle the daemon sends one datagram to every entry of `pose.receivers`:
+
+* a computer: `192.168.0.20:5600`;
+* a multicast group: `239.255.0.7:5600`. It stays on the local network;
+* every subscriber: `*:5601` ([below](#subscribing)).
+
+Multicast leaves by the interface that has the address `bind`: with 127.0.0.1 it stays on this computer. With 0.0.0.0 or
+`::` the system's routes decide. An IPv6 group may name its interface: `[ff15::42%eth0]:5600`. The loopback interface
+has no IPv6 groups.
+
+Values are little-endian and naturally aligned. The CRC-32 is that of zlib and IEEE 802.3. The daemon repeats nothing: a
+newer datagram follows a lost one. Read by `length`: a later version may append values under the same `version`. A
+reference reader in C is `tools/clients/listen_pose.c`.
 
 {NOT_KNOWN}
 
 {table(("byte", "name", "type", "step", "not known", "meaning"), rows)}
 
-States, reasons, faults, the numbers of `light_fix` and the bits of `flags`, `devices` and `witnesses` are those of
-[Modbus](modbus.md), where every single link can be read too.
+`state`, `reason` and `fault`: [States, reasons, faults](codes.md). The numbers of `light_fix`, the bits of `flags`,
+`devices` and `witnesses`, and the notes on each value are those of [Modbus](modbus.md). There you can also read every
+single link.
 
 {_subscribing()}
 ## Odometry and IMU datagrams
 
-With `odometry.port` set, the daemon takes wheel odometry and gyro readings as datagrams on that port. Little-endian,
-CRC-32 as above. A reference sender is `tools/clients/send_odometry.py`.
+With `odometry.port` set, the daemon takes wheel odometry and gyro readings as datagrams on that port. They are
+little-endian with the same CRC-32. A reference sender is `tools/clients/send_odometry.py`.
 
 {table(("byte", "type", "meaning"), _input_rows())}
 
-* Odometry is cumulative, so a lost datagram loses nothing; one that was overtaken is dropped, and so is a repeated one.
-* A sender that restarts draws a new `session` (or is silent for {inputs.SESSION_TIMEOUT_S:g} s) and may begin again
-  at pose 0: the daemon carries on without a jump. While one sender is heard, another session on the port is ignored;
-  where that lasts for more than a second the log says whose.
-* The time of a reading is the kernel's time of arrival. Where none has come for longer than usual although the sender's
-  own `time` has gone on as usual, those that come at last were held up: they are dated back by that, up to
-  {MAX_AGE_S:g} s. So are readings that are sent several at a time, each with the `time` it was taken at. Any clock does
-  for that; where it stands, is set or runs fast or slow, the arrival counts. Readings that keep coming more than
-  {LATE_S:g} s late are told (ODOMETRY_GAPS).
-* A sender on the same computer does better: it sets bit 0 of `flags` and puts CLOCK_MONOTONIC into `time`; a time in
-  the future or more than {MAX_AGE_S:g} s old is not believed.
-* Values that are not finite or beyond {input_codec.LARGEST:g}, a wrong length or a wrong CRC are dropped; the
-  log says what is wrong, and whose it is, where that lasts.
+* Odometry is cumulative, so a lost datagram loses nothing. The daemon drops repeated and overtaken ones.
+* A sender that restarts draws a new `session`, or is silent for {inputs.SESSION_TIMEOUT_S:g} s. It may begin again at
+  pose 0; the daemon continues without a jump.
+* The daemon takes one sender at a time. If another session sends for more than a second, the log names its address.
+* The time of a reading is the kernel's time of arrival. The daemon corrects delays from the sender's `time`, up to
+  {MAX_AGE_S:g} s: of datagrams that were held up, and of readings that are sent several at a time. Any clock will do.
+  Where that clock stops, is set, or runs fast or slow, the time of arrival counts.
+* Readings that keep arriving more than {LATE_S:g} s late are a fault (ODOMETRY_GAPS).
+* A sender on the same computer sets bit 0 of `flags` and puts CLOCK_MONOTONIC into `time`. The daemon does not believe
+  a time in the future or more than {MAX_AGE_S:g} s old.
+* The daemon drops values that are not finite or exceed {input_codec.LARGEST:g}, a wrong length and a wrong CRC. If that
+  lasts, the log states what is wrong and names the sender.
 """
 
 
 def _subscribing() -> str:
     return f"""## Subscribing
 
-With `*:PORT` among `pose.receivers`, a program gets pose datagrams by asking for them on that port:
-{udp_subscriptions.SIZE} bytes, little-endian, both ways. A reference client is `tools/clients/subscribe_pose.py`.
+With `*:PORT` in `pose.receivers`, a program subscribes to pose datagrams on that port. Request and answer have
+{udp_subscriptions.SIZE} bytes, little-endian. A reference client is `tools/clients/subscribe_pose.py`.
 
 {table(("byte", "type", "meaning"), _subscription_rows())}
 
-1. Send ASK with the lease that is wanted and cookie 0. The answer is COOKIE.
+1. Send ASK with the lease you want and cookie 0. The answer is COOKIE.
 2. Send ASK again with that cookie. The answer is GRANTED with the lease in seconds, {udp_subscriptions.LONGEST_LEASE_S}
-   at most, or FULL: there are never more than {udp_subscriptions.SUBSCRIBERS} subscribers. Pose datagrams come to the
-   socket that asked, from the port that was asked.
-3. Ask again with the cookie of the last answer before the lease is over, best after a third of it; if the answer is
-   COOKIE, repeat with the new one. A lease of 0 ends it.
+   at most, or FULL: there are never more than {udp_subscriptions.SUBSCRIBERS} subscribers. Pose datagrams then come to
+   your socket, from the port that you asked.
+3. Ask again with the cookie of the last answer before the lease ends, best after a third of it. If the answer is
+   COOKIE, repeat with the new one. A lease of 0 ends the subscription.
 
-Nobody can have datagrams sent to another's address, because only that one sees the cookie; an answer is never larger
-than what asked for it. Addresses that are not in `allow` get none.
+Nobody can direct datagrams to another address, because only that address receives the cookie. An answer is never larger
+than its request. Addresses that are not in `allow` get none.
 
 {table(("`status`", "name", "meaning"), _status_rows())}
 """

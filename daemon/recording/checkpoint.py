@@ -145,7 +145,7 @@ _submap_of: Final = attrgetter("submap")
 def capture(state: State, rest: dict[str, object]) -> Taken:
     """Captures the estimator state and the ``rest``, which may refer to the same objects.
 
-    The duration grows with the number of submaps and keyframes; docs/replay.md has figures.
+    The duration grows with the number of submaps and keyframes; docs/performance.md has figures.
 
     Raises:
         CannotTake: some part cannot be copied.

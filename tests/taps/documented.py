@@ -14,21 +14,21 @@ PROGRAMS: Final = ("lumiloop", "python", "make", "mbpoll", "evo_traj", "curl")
 RUN: Final = {
     "sessions": (
         r"simulator.md: python -m tools.sim -", r"simulator.md: lumiloop run", r"formats.md: lumiloop run",
-        r"replay.md: lumiloop run", r"README.md: lumiloop run",
+        r"replay.md: lumiloop run", r"start-lidar.md: lumiloop run",
     ),
     "beside": (
-        r"(README|operations).md: lumiloop status", r"README.md: mbpoll", r"view.md: lumiloop view(?! drive)",
+        r"(start-lidar|troubleshooting|operations).md: lumiloop status", r"(start-lidar|control).md: mbpoll",
+        r"view.md: lumiloop view(?! drive)",
         r"formats.md: lumiloop (metrics|foxglove)", r"formats.md: curl", r"stream.md: python tools/clients",
         r"planning.md: lumiloop lamps",
     ),
     "drive": (
-        r"README.md: lumiloop replay", r"README.md: lumiloop map export drive/", r"replay.md: lumiloop replay LOG",
+        r"replay.md: lumiloop replay (LOG|drive/)", r"replay.md: lumiloop map export drive/",
         r"replay.md: lumiloop why", r"view.md: lumiloop view drive/", r"formats.md: lumiloop export drive",
         r"formats.md: evo_traj",
     ),
     "maps": (
-        r"README.md: lumiloop map (?!export drive)", r"maps.md: lumiloop map (?!export drive)",
-        r"(maps.md: lumiloop map export drive|replay.md: lumiloop replay intel).*",
+        r"map-files.md: lumiloop map", r"replay.md: lumiloop replay intel",
     ),
     "alone": (
         r"air-interface.md: lumiloop codes", r"simulator.md: python -m tools.sim.(report|building.draw|light.draw)",
@@ -45,18 +45,25 @@ ELSEWHERE: Final = {
     r".*: lumiloop probe": "tests/daemon/cli/test_probe.py",
     r"calibration.md: lumiloop (survey|calibrate)": "tests/daemon/commissioning/test_teach_drive.py",
     r".*: make install": "tests/systemd/test_container.py",
-    r"README.md: make demo|simulator.md: (make demo|python -m tools.demo)": "tests/tools/demo/test_run.py",
+    r"README.md: make demo|(start-demo|simulator).md: lumiloop demo|simulator.md: python -m tools.demo": (
+        "tests/tools/demo/test_run.py"
+    ),
     r"fake-devices.md: (python -m hal.fake --model|lumiloop run)": "tests/daemon/processes/test_process.py",
     r"fake-devices.md: python -m hal.fake.adc.receiver": "tests/hal/fake/adc/test_receiver_process.py",
     r"bench.md: python -m tools.bench.world lap --local": "tests/tools/bench/world/test_world.py",
     r".*: (python -m tools.experiments|make experiments)": "tests/tools/experiments",
-    r"replay.md: python -m tests.logs": "tests/logs",
-    r"replay.md: mbpoll": "tests/daemon/replay/test_recorded_process.py::test_a_dump_is_asked_for_as_the_page_says",
+    r"data.md: python -m tests.logs": "tests/logs",
+    r"README.md: make docs": "tests/tools/docs/test_site.py",
+    r"replay.md: lumiloop dump": (
+        "tests/daemon/replay/test_recorded_process.py::test_a_dump_is_asked_for_as_the_page_says"
+    ),
+    r"control.md: lumiloop": "tests/daemon/cli/orders/test_give.py",
+    r"modbus.md: mbpoll": "tests/daemon/publish/test_document.py::test_the_lines_of_mbpoll_give_every_order",
 }
 """The test that runs it, or what it is made of where the whole takes minutes, hours, or the devices of a computer."""
 
 NOT_RUN: Final = {
-    r"README.md: make (venv|test|check|quick)|data.md: make test": "the tests themselves, and what they run in",
+    r"README.md: make test|start-lidar.md: make venv|data.md: make test": "the tests themselves, and what they run in",
     r"bench.md: python -m pytest tests/hil": "needs a lidar, a converter, a robot that moves",
     r"bench.md: python -m tools.bench.world (lap cable|lamps)": "needs a USB gadget, a converter from numbers to light",
     r"bench.md: make bench-vm": "an emulated computer: minutes, and root for the first time",

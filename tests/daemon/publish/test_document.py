@@ -55,6 +55,18 @@ def test_every_line_of_mbpoll_counts_from_0() -> None:
     assert not {(page, line) for page, line in asking if " -0 " not in line}
 
 
+def test_the_words_of_set_pose_are_those_of_the_command_block() -> None:
+    """`docs/control.md` has them for mbpoll."""
+    page = (DOCS / "control.md").read_text()
+    ((x, y, yaw, told),) = re.findall(r"SET_POSE to x (\S+) m, y (\S+) m, yaw (\S+) rad \| `([\d ]+)` \|", page)
+    words = struct.pack(">8H", *map(int, told.split()))
+    request, command, *pose = struct.unpack(">HHiii", words)
+    assert (request, command) == (1, CommandCode.SET_POSE)
+    assert pose == [round(1e4 * float(x)), round(1e4 * float(y)), round(1e6 * float(yaw))]
+    for name, number in re.findall(r"^\| ([A-Z_]+)\b.*`1 (\d+)` \|$", page, re.MULTILINE):
+        assert CommandCode[name] == int(number)
+
+
 def test_writing_makes_the_pages(tmp_path: Path) -> None:
     document.write(tmp_path / "new")
     assert {path.name for path in (tmp_path / "new").iterdir()} == set(document.pages())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 
 from daemon.cli import status_table
+from daemon.cli.reports.status import as_object
 from daemon.health.faults import Fault
 from daemon.publish import document
 from daemon.publish.modbus import integrity_block, parts_block, registers
@@ -86,4 +87,7 @@ def test_status_shows_what_follows_from_a_fault_below_it() -> None:
     assert [line.split(":")[0] for line in shown] == [" 104", " 306", "   follows", "   follows", " 401"]
     assert "106: more than 2 % of the lidar's scans" in shown[2]
     assert "take load off" not in shown[3], "the remedy is that of the cause"
-    assert status_table.as_object(reading, False)["fault_causes"] == {"106": 306, "301": 306}
+    told = as_object(reading, False)["faults"]
+    assert [(one["number"], one["cause"]) for one in told] == [
+        (104, None), (306, None), (106, 306), (301, 306), (401, None)
+    ]  # fmt: skip
