@@ -7,7 +7,7 @@ wheels (A. Censi et al., IEEE Trans. Robotics 29, 2013). Wheels slip and matches
 likelihood. Errors can change, as when a mount is knocked: they are also estimated from recent steps alone, and these
 replace the former ones where both exclude each other.
 
-The estimated wheel errors correct the prediction (`corrected`). A large error of the mount is corrected too
+Large wheel errors correct the prediction (`corrected`), a large error of the mount corrects the mount
 (`mount_correction`).
 """
 
@@ -39,8 +39,9 @@ NOISE: Final = (0.012, 0.012, 0.006)
 """Sigmas (m, m, rad) of the two matches that limit a step."""
 SLIP, SLIP_TURN, SLIP_DRIFT = 0.02, 0.1, 0.01
 """Random part of wheel motion over one step: share of distance, share of turn, and turn per metre (rad/m)."""
-FIRST_NOISE, LEARNING, FEWEST = 4.0, 0.05, 4
-"""Initial factor on these variances, the share of one step in it, and the fewest steps that show it."""
+FIRST_NOISE, WEIGHT, LEARNING, FEWEST = 10.0, 4, 0.05, 12
+"""Initial factor on these variances, as of the worst robots in recordings, and its weight in steps; least share of one
+step in the learned factor; fewest steps before an error is named: one slip must not decide."""
 NU: Final = 4.0
 """Degrees of freedom of the Student-t likelihood: the heavy tail of slip."""
 RECENT: Final = 20
@@ -54,7 +55,7 @@ MOST_LEARNED: Final = 16.3
 """Largest squared Mahalanobis distance (99.9 % of chi-square with 3 degrees) of which the noise is learned."""
 SMALL: Final = 1e-4
 """Difference for the derivatives by the mount."""
-LARGE, SURE = 3.0, 2.0
+LARGE, SURE = 3.0, 2.5
 """Sigmas of a sound robot beyond which an error is large, and sigmas of the estimate by which it must exceed that."""
 
 
@@ -74,7 +75,8 @@ class WheelCalibration:
         errors: of all steps since the last change. recent, former: of the steps since the latest of every
             :data:`RECENT`, and of those before; the two share no data.
         steps: number of steps.
-        fix: the three wheel errors as corrected: of a sound robot, unless one error is shown to be large.
+        fix: the three wheel errors as corrected: zero, unless one is large. Small ones are known from matches alone. A
+            correction would make the prediction repeat what matches say, and drift with them along corridors.
         path: (x, y, yaw) of the wheels since the step began, without the estimated errors.
         slopes: its derivatives (3, 3) by the three wheel errors.
         latest, span: latest reading (x, y, yaw), and its duration, s.
@@ -203,7 +205,8 @@ def compare(wheels: WheelCalibration, made: Array) -> None:
     wheels.errors, square = updated(wheels.errors, off, J, R)
     wheels.recent, recent_square = updated(wheels.recent, recent_off, J, R)
     least = min(square, recent_square, MOST_LEARNED)
-    wheels.noise = max(1.0, wheels.noise * (1.0 + LEARNING * (least / 3.0 - 1.0)))
+    share = max(LEARNING, 1.0 / (wheels.steps + WEIGHT))
+    wheels.noise = max(1.0, wheels.noise * (1.0 + share * (least / 3.0 - 1.0)))
     wheels.steps += 1
     apart = wheels.recent.x - wheels.former.x
     if float(apart @ np.linalg.solve(wheels.recent.P + wheels.former.P, apart)) > CHANGED:
@@ -211,7 +214,7 @@ def compare(wheels: WheelCalibration, made: Array) -> None:
     if wheels.steps % RECENT == 0:
         wheels.former, wheels.recent = wheels.errors, Errors()
     wheels.told = judged(wheels.errors, wheels.mount) if wheels.steps >= FEWEST else None
-    wheels.fix = (wheels.errors.x if wheels.told is not None else of_sound_robot(wheels.errors))[:3]
+    wheels.fix = wheels.errors.x[:3] if wheels.told is not None and wheels.told.wheels else np.zeros(3)
 
 
 def slopes_of(wheels: WheelCalibration) -> Array:
@@ -249,10 +252,3 @@ def judged(errors: Errors, mount: Array) -> SlowErrors | None:
     if not large.any():
         return None
     return SlowErrors(tuple(x.tolist()), tuple(sigma.tolist()), tuple(large.tolist()))
-
-
-def of_sound_robot(errors: Errors) -> Array:
-    """The errors (5,) under the narrower prior of a robot without large ones."""
-    told = np.linalg.inv(errors.P)
-    more = SOUND**-2 - WIDE**-2
-    return np.asarray(np.linalg.solve(told + np.diag(more), told @ errors.x))

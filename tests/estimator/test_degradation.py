@@ -57,8 +57,7 @@ def test_carried_by_the_wheels_scans_are_passed_over_and_fit_again_afterwards() 
         at(state, k, UNLIMITED)
     results = [at(state, k, replace(UNLIMITED, level=DegradationLevel.CARRIED)) for k in range(40, 140)]
     assert {result.match and result.match.reason for result in results} == {Reason.PASSED_OVER}
-    carried = off(results[-1], TRUTH[139])
-    assert 0.005 < carried < 0.02, "wheels that count 2 % too far carry the pose, and only that scale is corrected"
+    assert off(results[-1], TRUTH[139]) > 0.02, "wheels that count 2 % too far carry the pose, and nothing corrects it"
     grown = np.diag(results[-1].covariance) - np.diag(results[0].covariance)
     assert (grown[:2] > 0.0).all(), "and it says so"
     again = [at(state, k, UNLIMITED) for k in range(140, 150)]

@@ -63,9 +63,9 @@ def test_a_sound_robot_has_no_large_error(seed: int) -> None:
 @pytest.mark.parametrize(
     ("x", "way_m"),
     [
-        (errors(distance=-0.17), 5.0),
-        (errors(distance=0.2), 5.0),
-        (errors(turn=0.2), 10.0),
+        (errors(distance=-0.17), 15.0),
+        (errors(distance=0.2), 15.0),
+        (errors(turn=0.2), 20.0),
         (errors(drift=12.0), 20.0),
         (errors(yaw=3.0), 20.0),
         (errors(yaw=-6.0), 20.0),
