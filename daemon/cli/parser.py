@@ -51,8 +51,7 @@ def _set_level(level: str) -> None:
     from daemon.system.logging import set_level
 
     set_level(level)
-    if level == "error":
-        console.be_quiet()
+    console.be_quiet(level == "error")
 
 
 class _Program(CommandParser):

@@ -24,9 +24,9 @@ class _Output:
     quiet = False
 
 
-def be_quiet() -> None:
-    """Print no notes and no progress from now on; errors and results stay."""
-    _Output.quiet = True
+def be_quiet(quiet: bool = True) -> None:
+    """Print no notes and no progress from now on, or print them again; errors and results stay."""
+    _Output.quiet = quiet
 
 
 def note(text: str) -> None:

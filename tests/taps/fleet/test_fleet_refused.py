@@ -53,7 +53,7 @@ def test_a_domain_that_ros_does_not_have_is_refused(capsys: pytest.CaptureFixtur
 def test_what_is_not_shared_cannot_be_fetched(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         parser.main(["fleet", "fetch", "maps"])
-    assert capsys.readouterr().err.endswith("maps: name survey, map, or none for both\n")
+    assert "maps: name survey, map, or none for both\n" in capsys.readouterr().err
     for words in ([], ["map"], ["survey", "map"]):
         assert parser.parser().parse_args(["fleet", "fetch", *words]).what == words
 

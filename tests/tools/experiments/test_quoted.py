@@ -10,7 +10,11 @@ from typing import Any
 import pytest
 
 DOCS = Path(__file__).parents[3] / "docs"
-PAGES = "\n".join(page.read_text() for page in sorted(DOCS.rglob("*.md")) if page.parent.name != "results")
+PAGES = "\n".join(
+    page.read_text()
+    for page in sorted(DOCS.rglob("*.md"))
+    if page.parent.name != "results" or page.name.startswith("measured-")
+)
 
 
 def tables(name: str) -> dict[str, Any]:
@@ -50,4 +54,3 @@ def test_light_as_driven_does_not_raise_recall() -> None:
     assert lit < laser
     for words in ("Light as driven does not raise recall**: {} with lights, {} by the laser alone",):
         assert words.format(f"{lit:.1f} %", f"{laser:.1f} %") in PAGES
-    assert f"light does not raise recall: {lit:.1f} against {laser:.1f} %" in PAGES
