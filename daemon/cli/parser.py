@@ -33,7 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         words = parser()
         args = words.parse_args(argv)
-        if (level := getattr(args, "log_level", None)) is not None:
+        level = getattr(args, "log_level", None)
+        console.be_quiet(level == "error")
+        if level is not None:
             _set_level(level)
         body: Body | None = getattr(args, "body", None)
         if body is None:
@@ -51,7 +53,6 @@ def _set_level(level: str) -> None:
     from daemon.system.logging import set_level
 
     set_level(level)
-    console.be_quiet(level == "error")
 
 
 class _Program(CommandParser):
