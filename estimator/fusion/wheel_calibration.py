@@ -26,6 +26,8 @@ from estimator.result import SlowError, SlowErrors
 
 STEP_M, STEP_RAD = 1.0, 0.5
 """Distance (m) and turn (rad) of one step: matches are then accurate to a per cent or two of it."""
+LARGEST_STEP: Final = 10.0
+"""Distance (m) and turn (rad) of a step that is an error of odometry: one reading ends it."""
 LONGEST_S: Final = 10.0
 """Longest duration (s) of a step; a robot that hardly moves shows nothing."""
 SPLIT_S: Final = 0.5
@@ -134,7 +136,8 @@ def on_odometry(wheels: WheelCalibration, record: Odometry) -> None:
     if not usable:
         return
     wheels.latest, wheels.span = record.delta, span
-    extend(wheels, record.delta)
+    if wheels.begun is not None:
+        extend(wheels, record.delta)
     if match is not None and match[0] <= record.t_end:
         wheels.waiting = None
         take(wheels, *match)
@@ -148,6 +151,9 @@ def extend(wheels: WheelCalibration, delta: Array) -> None:
     way, J = math.copysign(math.hypot(dx, dy), dx), wheels.slopes
     turn = (1.0 + b) * dyaw + c * way
     half = yaw + 0.5 * (turn - dyaw)
+    if not math.isfinite(half):  # readings of an absurd size
+        wheels.begun = None
+        return
     cos, sin = math.cos(half), math.sin(half)
     ux, uy = cos * dx - sin * dy, sin * dx + cos * dy
     px, py = (1.0 + a) * ux, (1.0 + a) * uy
@@ -199,11 +205,16 @@ def compare(wheels: WheelCalibration, made: Array) -> None:
     off, J = made - on_mount(wheels.path, wheels.errors.x), slopes_of(wheels)
     off[2] = se2.wrap(float(off[2]))
     way, turned = math.hypot(*wheels.path[:2].tolist()), abs(float(wheels.path[2]))
+    if not max(way, turned) < LARGEST_STEP:
+        return
     slip, turn = (SLIP * way) ** 2, (SLIP_TURN * turned) ** 2 + (SLIP_DRIFT * way) ** 2
     R = wheels.noise * np.diag((NOISE[0] ** 2 + slip, NOISE[1] ** 2 + slip, NOISE[2] ** 2 + turn))
     recent_off = off - J @ (wheels.recent.x - wheels.errors.x)
-    wheels.errors, square = updated(wheels.errors, off, J, R)
-    wheels.recent, recent_square = updated(wheels.recent, recent_off, J, R)
+    errors, square = updated(wheels.errors, off, J, R)
+    recent, recent_square = updated(wheels.recent, recent_off, J, R)
+    if not (math.isfinite(square + recent_square) and np.isfinite(errors.x).all() and np.isfinite(recent.x).all()):
+        return
+    wheels.errors, wheels.recent = errors, recent
     least = min(square, recent_square, MOST_LEARNED)
     share = max(LEARNING, 1.0 / (wheels.steps + WEIGHT))
     wheels.noise = max(1.0, wheels.noise * (1.0 + share * (least / 3.0 - 1.0)))

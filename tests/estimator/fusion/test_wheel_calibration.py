@@ -112,6 +112,22 @@ def test_odd_readings_change_nothing(delta: tuple[float, float, float]) -> None:
     assert wheels.errors is before
 
 
+@pytest.mark.filterwarnings("ignore:overflow|invalid")
+@pytest.mark.parametrize("size", [1e6, 1e100, 1e160, 1e300, 1.7e308])
+def test_readings_of_an_absurd_size_do_not_spoil_the_estimate(size: float) -> None:
+    wheels = WheelCalibration()
+    t = play(wheels, errors(), 1, 20.0)
+    for k in range(6):
+        on_odometry(wheels, Odometry(t, t + READING_S, np.array((size, -size, size))))
+        t += READING_S
+        on_match(wheels, t, se2.identity(), True)
+        corrected(wheels, Odometry(t, t + READING_S, np.array((size, size, -size) if k % 2 else (size, 0.0, size))))
+    assert np.isfinite(wheels.errors.x).all()
+    play(wheels, errors(distance=0.2), 2, 40.0, t=t)
+    assert wheels.told is not None
+    assert wheels.errors.x[SlowError.DISTANCE] == pytest.approx(0.2, abs=0.05)
+
+
 def test_a_gap_in_the_readings_ends_the_step() -> None:
     wheels = WheelCalibration()
     t = play(wheels, errors(), 1, 5.0)
