@@ -12,7 +12,8 @@ HEAD: Final = """<!-- Written by `python -m tools.docs.commands`; edit the comma
 # Commands
 
 Every command prints the same with `--help`, and two examples with `lumiloop help COMMAND`. The installation has man
-pages and completion for bash, zsh and fish. Elsewhere: `lumiloop man --out DIR`, `eval "$(lumiloop completion bash)"`.
+pages and completion for bash, zsh and fish. Elsewhere: `lumiloop man --out DIR`; `eval "$(lumiloop completion bash)"`,
+with zsh after `compinit`; in fish `lumiloop completion fish | source`.
 
 * **Exit code:** 0 done; 1 failed or refused; 2 wrong usage or configuration; 130 interrupted.
 * **Output:** results go to stdout; notes, progress and errors go to stderr. Every command takes `-q` (errors and

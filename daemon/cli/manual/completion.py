@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from typing import Final
 
 from daemon.cli.manual.command_parser import every, subcommands, summaries
@@ -34,7 +35,7 @@ ZSH: Final = """\
 # zsh completion of lumiloop; written by `lumiloop completion zsh`
 _lumiloop() {{
     local context="" word at
-    local -a entries
+    local -a entries options
     for ((at = 2; at < CURRENT; at++)); do
         word=$words[at]
         case "$context $word" in
@@ -44,8 +45,12 @@ _lumiloop() {{
     case "$context" in
 {cases}
     esac
-    _describe -o lumiloop entries
-    [[ $PREFIX != -* ]] && _files
+    if [[ $PREFIX = -* ]]; then
+        _describe -o option options
+    else
+        _describe command entries
+        _files
+    fi
 }}
 if [[ $funcstack[1] = _lumiloop ]]; then _lumiloop; else compdef _lumiloop lumiloop; fi
 """
@@ -65,6 +70,12 @@ def options(parser: argparse.ArgumentParser) -> list[tuple[str, str, bool]]:
     return found
 
 
+def values(parser: argparse.ArgumentParser) -> dict[str, str]:
+    """The commands, verbs or fixed words that may stand next, each with its help (empty for a fixed word)."""
+    fixed = [action.choices or () for action in parser._actions if not action.option_strings]
+    return {str(word): "" for words in fixed for word in words} | summaries(parser)
+
+
 def _contexts(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.ArgumentParser]]:
     """Every command with the words that precede what is completed, as the scripts join them."""
     return [("", parser), *(("".join(f" {word}" for word in words), one) for words, one in every(parser))]
@@ -73,7 +84,7 @@ def _contexts(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.Argum
 def _bash(parser: argparse.ArgumentParser) -> str:
     cases = []
     for context, one in _contexts(parser):
-        words = [*subcommands(one), *(word for word, _, _ in options(one))]
+        words = [*values(one), *(word for word, _, _ in options(one))]
         cases.append(f'        "{context}") words="{" ".join(words)}" ;;')
     return BASH.format(paths=_paths(parser), cases="\n".join(cases))
 
@@ -85,10 +96,15 @@ def _paths(parser: argparse.ArgumentParser) -> str:
 def _zsh(parser: argparse.ArgumentParser) -> str:
     cases = []
     for context, one in _contexts(parser):
-        rows = [*summaries(one).items(), *((word, text) for word, text, _ in options(one))]
-        entries = " ".join(_quoted(f"{word.replace(':', chr(92) + ':')}:{text}") for word, text in rows)
-        cases.append(f'        "{context}") entries=({entries}) ;;')
+        entries = _described(values(one).items())
+        described = _described((word, text) for word, text, _ in options(one))
+        cases.append(f'        "{context}") entries=({entries}) options=({described}) ;;')
     return ZSH.format(paths=_paths(parser), cases="\n".join(cases))
+
+
+def _described(rows: Iterable[tuple[str, str]]) -> str:
+    """Words with their help, as elements of an array for zsh's `_describe`."""
+    return " ".join(_quoted(f"{word.replace(':', chr(92) + ':')}:{text}") for word, text in rows)
 
 
 def _fish(parser: argparse.ArgumentParser) -> str:
@@ -100,7 +116,7 @@ def _fish(parser: argparse.ArgumentParser) -> str:
         deepest = f"not __fish_seen_subcommand_from {below}" if below else ""
         where = "; and ".join(filter(None, (seen, deepest))) or "__fish_use_subcommand"
         begin = f"complete -c lumiloop -n {_quoted(where)}"
-        lines += [f"{begin} -a {word} -d {_quoted(text)}" for word, text in summaries(one).items()]
+        lines += [f"{begin} -a {word} -d {_quoted(text)}" for word, text in values(one).items()]
         for word, text, value in options(one):
             kind = f"-l {word[2:]}" if word.startswith("--") else f"-s {word[1:]}"
             lines.append(f"{begin} {kind}{' -r' if value else ''} -d {_quoted(text)}")

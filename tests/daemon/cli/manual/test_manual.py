@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
+import pty
 import re
+import select
 import shlex
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -132,6 +136,59 @@ def test_bash_completes_commands_verbs_and_options(tmp_path: Path) -> None:
     assert completed("lumiloop -v status --j", tmp_path) == {"--json"}
     assert completed("lumiloop map import --na", tmp_path) == {"--name"}
     assert completed("lumiloop replay dr", tmp_path) == {"drive.log"}
+    for line, whole in TYPED.items():
+        assert completed(line, tmp_path) == {whole.rpartition(" ")[2]}
+
+
+TYPED = {
+    "lumiloop set-p": "lumiloop set-pose",
+    "lumiloop status --js": "lumiloop status --json",
+    "lumiloop map ex": "lumiloop map export",
+    "lumiloop completion z": "lumiloop completion zsh",
+}
+"""Beginnings of lines, and what the tabulator key makes of them."""
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
+@pytest.mark.parametrize("line", TYPED)
+def test_zsh_completes_commands_verbs_and_options(line: str, tmp_path: Path) -> None:
+    (tmp_path / "script").write_text(script("zsh", parser.parser()))
+    terminal, screen = pty.openpty()
+    environment = {"PATH": os.environ["PATH"], "TERM": "dumb", "HOME": str(tmp_path)}
+    shell = subprocess.Popen(
+        ["zsh", "-f", "-i"], stdin=screen, stdout=screen, stderr=screen, env=environment, start_new_session=True
+    )
+    os.close(screen)
+    try:
+        prepare = f'cd {tmp_path}; autoload -Uz compinit; compinit -u -D; eval "$(cat script)"; print re""ady\n'
+        assert "ready" in printed(terminal, prepare, "ready")
+        assert TYPED[line] in printed(terminal, line + "\t", TYPED[line])
+    finally:
+        shell.kill()
+        shell.wait()
+        os.close(terminal)
+
+
+def printed(terminal: int, keys: str, wanted: str) -> str:
+    """What a terminal shows after these keys, without bells and repaired characters, until it has what is wanted."""
+    os.write(terminal, keys.encode())
+    seen, text, end = b"", "", time.monotonic() + 30.0
+    while wanted not in text and select.select([terminal], [], [], max(0.0, end - time.monotonic()))[0]:
+        seen += os.read(terminal, 4096)
+        text = re.sub(r"\a|.\x08", "", seen.decode(errors="replace"))
+    return text
+
+
+@pytest.mark.skipif(shutil.which("fish") is None, reason="fish is not installed")
+@pytest.mark.parametrize("line", TYPED)
+def test_fish_completes_commands_verbs_and_options(line: str, tmp_path: Path) -> None:
+    (tmp_path / "script").write_text(script("fish", parser.parser()))
+    program = f"source script; complete -C {shlex.quote(line)}"
+    environment = {"PATH": os.environ["PATH"], "HOME": str(tmp_path)}
+    done = subprocess.run(
+        ["fish", "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert [row.partition("\t")[0] for row in done.stdout.splitlines()] == [TYPED[line].rpartition(" ")[2]]
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
