@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,12 +25,19 @@ from daemon.publish.modbus.points import Layout, Point
 from daemon.publish.modbus.requests import BLOCKS
 from daemon.system.console import FAILED, OK, fail
 
+_INPUT: Final = "input register"
 _BLOCKS: Final = (
-    ("input register", registers.BODY_ADDRESS, registers.BODY),
-    *(("input register", block.body, block) for block in BLOCKS),
+    (_INPUT, registers.BODY_ADDRESS, registers.BODY),
+    *((_INPUT, block.body, block) for block in BLOCKS),
     ("holding register", holding.COMMAND_ADDRESS, holding.COMMAND),
+    ("holding register", holding.LOOP_ADDRESS, holding.LOOP),
     ("holding register", holding.ODOMETRY_ADDRESS, holding.ODOMETRY),
 )
+_FRAMES: Final = (
+    (0, registers.BLOCK_WORDS, registers.MODBUS_MAGIC, registers.VERSION),
+    *((block.address, block.registers, block.magic, block.version) for block in BLOCKS),
+)
+"""Of each block with a head its address, number of registers, magic and version."""
 _BITS: Final = (
     ("bit of `flags`", registers.FLAGS),
     ("bit of `devices`", registers.DEVICES),
@@ -105,10 +113,16 @@ def _hint(asked: str, everything: Sequence[Entry]) -> str:
             return f"name a number, too, as in: {kind} {entry.numbers[0]}"
     names = {entry.name.lower() for entry in everything}
     near = [] if asked[-1:].isdigit() else difflib.get_close_matches(asked.lower(), names, n=3, cutoff=0.7)
+    near = near or sorted(name for name in names if _inside(asked.lower(), name))[:3]
     if near:
         return f"did you mean {' or '.join(near)}?"
     kinds = "a key, a state, a fault, a reason, a command, a register, a bit or a port"
     return f"ask for {kinds}, as in: fault 302, TRACKING, bind"
+
+
+def _inside(asked: str, name: str) -> bool:
+    """Whether a name contains a requested word, as `cycle.budget_ms` contains `budget`."""
+    return asked in re.split(r"[._]", name)
 
 
 def entries() -> Iterator[Entry]:
@@ -145,6 +159,8 @@ def _names(kind: str, table: Mapping[Any, str]) -> Iterator[Entry]:
 def _registers() -> Iterator[Entry]:
     for kind, start, layout in _BLOCKS:
         yield from _points(kind, start, layout)
+    yield from _mirror()
+    yield from _frames()
     for kind, bits in _BITS:
         for number, (name, text, _) in enumerate(bits):
             yield Entry(kind, name, range(number, number + 1), f"set when {text}")
@@ -155,6 +171,24 @@ def _points(kind: str, start: int, layout: Layout) -> Iterator[Entry]:
         step = f", steps of 1/{point.per_unit} {point.unit}" if point.per_unit > 1 else ""
         text = f"{point.label}. {_elsewhere(point)}".strip().rstrip(".") + f" ({point.wire.name}{step})"
         yield Entry(kind, point.name, range(start + offset, start + offset + point.wire.words), text)
+
+
+def _mirror() -> Iterator[Entry]:
+    start = registers.MIRROR_ADDRESS
+    yield Entry(_INPUT, "seq", range(start, start + 2), "snapshot number (uint32)")
+    for number, point in enumerate(registers.MIRROR, 1):
+        at = start + 2 * number
+        yield Entry(_INPUT, point.name, range(at, at + 2), f"{point.label} (float32, {point.unit or 'no unit'})")
+    end = start + registers.MIRROR_WORDS
+    yield Entry(_INPUT, "seq_end", range(end - 2, end), "the same as `seq` (uint32)")
+
+
+def _frames() -> Iterator[Entry]:
+    for start, words, magic, version in _FRAMES:
+        end = start + words
+        yield Entry(_INPUT, "magic", range(start, start + 1), f"0x{magic:04X}: start of this block (uint16)")
+        yield Entry(_INPUT, "version", range(start + 1, start + 2), f"version of this block: {version} (uint16)")
+        yield Entry(_INPUT, "seq_end", range(end - 2, end), "the same as `seq`: the block is of one snapshot (uint32)")
 
 
 def _elsewhere(point: Point) -> str:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 
-from daemon.cli.explain import entries, find
+from daemon.cli.explain import Entry, entries, find
 from daemon.cli.parser import main, parser
 from daemon.config.loader import options
 from daemon.config.schema import Config
@@ -16,6 +18,8 @@ from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.modbus import holding
 from daemon.snapshot import LightFix, LinkUse, LoopReason, State
 from daemon.system.console import FAILED, OK
+
+ROOT = Path(__file__).parents[3]
 
 
 def _told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -92,6 +96,21 @@ def test_a_register_in_the_middle_of_a_value_is_that_value(capsys: pytest.Captur
     assert "acknowledge" in _told(capsys, "holding register", str(holding.COMMAND_ADDRESS + 8))
 
 
+def test_every_register_of_the_document_is_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = re.findall(r"^\| (\d+) \| `(\w+)` \|", (ROOT / "docs" / "modbus.md").read_text(), re.MULTILINE)
+    numbers = [(int(number), name) for number, name in rows if int(number) >= 16]  # below also bits and functions
+    assert {104, 200, 340, 354, 400, 1000, 1050, 1106} <= {number for number, _ in numbers}
+    everything = list(entries())
+    missing = [(number, name) for number, name in numbers if name not in names_of(number, everything)]
+    assert missing == []
+    assert "float32, m)" in _told(capsys, "register", "105")
+
+
+def names_of(number: int, everything: list[Entry]) -> set[str]:
+    """Names of the registers at an address."""
+    return {entry.name for entry in find(f"register {number}", everything)}
+
+
 def test_names_in_any_case(capsys: pytest.CaptureFixture[str]) -> None:
     assert "two solutions agree" in _told(capsys, "tracking")
     assert "weaker than expected here" in _told(capsys, "OCCLUDED")
@@ -100,6 +119,8 @@ def test_names_in_any_case(capsys: pytest.CaptureFixture[str]) -> None:
 def test_what_is_not_known_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", "sigma_jaw"]) == FAILED
     assert "sigma_yaw" in capsys.readouterr().err
+    assert main(["explain", "budget"]) == FAILED
+    assert "cycle.budget_ms" in capsys.readouterr().err
     for strange in ("99999", "nonsense"):
         assert main(["explain", strange]) == FAILED
         assert "ask for" in capsys.readouterr().err
