@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from daemon.replay import convert
+from daemon.replay.sources import open_log
 from daemon.system import console
+from hal.errors import HalError
 
 
 def main(args: argparse.Namespace) -> int:
@@ -14,8 +17,17 @@ def main(args: argparse.Namespace) -> int:
     try:
         scans = convert.convert(args.source, args.log, args.logged, delay, args.all)
     except convert.NotConverted as error:
-        return console.fail(str(error))
+        return console.fail(_replayable(args.source) or str(error))
     for sentence in scans.report.sentences():
         console.say(f"{args.source}: {sentence}")
     console.say(f"{len(scans.stamps)} scans of {scans.ranges.shape[1]} beams into {args.log}")
     return console.OK
+
+
+def _replayable(path: Path) -> str:
+    """What reads a log that needs no conversion; empty for any other file."""
+    try:
+        kind = open_log(path).kind
+    except HalError:
+        return ""
+    return f"{path}: a {kind} needs no conversion; use `lumiloop replay`, `lumiloop export` or `lumiloop map export`"

@@ -237,12 +237,21 @@ def _map(parser: argparse.ArgumentParser) -> None:
     render.set_defaults(body=estimating("daemon.cli.maps.convert", "render", "map_file", "warm-plan"))
     _map_changes(verbs)
     info = verbs.add_parser("info", help="say what a map file holds")
-    info.add_argument("map", type=Path, metavar="FILE", help="map file, *.lumimap")
+    info.add_argument(
+        "map", type=Path, nargs="?", metavar="FILE", help="map file, or a folder; default: list the configured folder"
+    )
     info.add_argument("--json", action="store_true", help="machine-readable output")
-    info.set_defaults(body=loaded("daemon.cli.maps.info", "info"))
+    config_arguments(info)
+    info.set_defaults(body=_map_info)
     verify = verbs.add_parser("verify", help="say whether map files are whole and consistent")
     verify.add_argument("maps", type=Path, nargs="+", metavar="FILE", help="map files, *.lumimap")
     verify.set_defaults(body=loaded("daemon.cli.maps.info", "verify"))
+
+
+def _map_info(args: argparse.Namespace) -> int:
+    """A named file or folder needs no configuration."""
+    module = "daemon.cli.maps.info"
+    return (later(module, "folder") if args.map is None or args.print_config else loaded(module, "info"))(args)
 
 
 def _margin(parser: argparse.ArgumentParser) -> None:

@@ -41,9 +41,10 @@ def _rounded(value: float, decimals: int) -> float:
 
 
 def configuration_lines(config: Config) -> list[str]:
-    """Returns the mount as lines of the configuration file."""
+    """Returns the command that writes the mount into the configuration file."""
     mount = config.lidar.mount
-    return ["", "[lidar.mount]", f"x = {mount.x:.4f}", f"y = {mount.y:.4f}", f"yaw = {mount.yaw:.3f}", ""]
+    values = (("x", f"{mount.x:.4f}"), ("y", f"{mount.y:.4f}"), ("yaw", f"{mount.yaw:.3f}"))
+    return ["", f"lumiloop config set {' '.join(f'lidar.mount.{name}={value}' for name, value in values)}", ""]
 
 
 def fit_drive(drive: Drive) -> WheelFit:

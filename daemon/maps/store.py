@@ -208,6 +208,18 @@ class Store:
                 aside = (self.folder / name).replace(self.folder / (name + BROKEN))
                 log.warning("%s: a start without it has lasted; it is kept for whoever mends that", aside)
 
+    def identity(self, generation: Generation) -> int:
+        """Identity of the map in a file: from its name, or from the content of a file that an operator placed there.
+
+        Negative: such a file cannot be read as a map.
+        """
+        if generation.number:
+            return generation.map_id
+        try:
+            return read(read_regular(generation.path, MOST_BYTES)).meta.map_id
+        except (BadMap, OSError, MemoryError):
+            return generation.map_id
+
     def load_map(self, map_id: int, judge: Judge = unjudged) -> Start:
         """The newest good generation of one map.
 
@@ -216,7 +228,7 @@ class Store:
         """
         failure: BadMap | OSError = Foreign(f"there is no map {map_id:08x} in {self.folder}")
         for generation in self.generations():
-            if generation.map_id == map_id:
+            if self.identity(generation) == map_id:
                 try:
                     start = self._read(generation, judge)
                 except (BadMap, OSError) as error:

@@ -91,6 +91,11 @@ class Maps:
     keep: Callable[[str, bytes], None] | None = None
 
 
+def _identities(store: Store) -> set[int]:
+    """Maps of the folder."""
+    return {found for one in store.generations() if (found := store.identity(one)) >= 0}
+
+
 class MapSwitch:
     """Carries out switches, one at a time.
 
@@ -133,7 +138,7 @@ class MapSwitch:
         if map_id == self._autosaver.map_id:
             return IN_USE
         try:
-            there = {one.map_id for one in await run_in_thread(store.generations, "switch") if one.map_id >= 0}
+            there = await run_in_thread(partial(_identities, store), "switch")
         except OSError as error:
             return f"{store.folder}: {said(error)}"
         if map_id not in there:

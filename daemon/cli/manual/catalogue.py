@@ -21,11 +21,11 @@ GROUPS: Final = (
     Group(
         "Orders",
         "tell a running daemon what to do",
-        ("set-pose", "relocalise", "pause", "resume", "save-map", "switch-map", "dump"),
+        ("set-pose", "relocalise", "reset", "pause", "resume", "save-map", "switch-map"),
     ),
     Group("Maps", "import, draw, align and examine maps", ("map",)),
     Group("Lamps", "plan, survey, calibrate and maintain lamps", ("plan", "survey", "calibrate", "lamps", "codes")),
-    Group("Logs", "replay and convert recordings", ("replay", "convert", "export", "record-mcap")),
+    Group("Logs", "keep, replay and convert recordings", ("dump", "replay", "convert", "export", "record-mcap")),
     Group("Connect", "other programs, and other robots", ("ros2", "foxglove", "metrics", "fleet")),
     Group("Tools", "help and installation", ("help", "completion", "man", "warm")),
 )
@@ -78,6 +78,10 @@ EXAMPLES: Final[dict[str, tuple[tuple[str, str], tuple[str, str]]]] = {
     "relocalise": (
         ("relocalise", "search the whole map for the robot"),
         ("relocalise --timeout 300", "wait five minutes for the result"),
+    ),
+    "reset": (
+        ("reset", "begin a new map here"),
+        ("reset --host 192.168.1.20", "on another computer"),
     ),
     "pause": (
         ("pause", "before people crowd in, or a lift moves the robot"),

@@ -20,6 +20,7 @@ Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse h
 SIMPLE: Final = (
     ("relocalise", "RELOCALISE", "search the whole map for the robot, which was carried away"),
     ("save-map", "SAVE_MAP", "write the map to the disk now"),
+    ("reset", "RESET", "forget pose and map, and begin a new map; stored maps remain"),
     ("pause", "PAUSE", "stop using the lidar and changing the map, until `resume`"),
     ("resume", "RESUME", "end a pause"),
     ("dump", "DUMP_RECORDER", "write the flight recorder's content to the disk"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -143,8 +142,11 @@ def test_the_mount_is_written_as_a_configuration_with_a_picture(
     before = driven.config
     assert msgspec.structs.replace(written, lidar=before.lidar) == before
     assert msgspec.structs.replace(written.lidar, mount=before.lidar.mount) == before.lidar
-    pasted = tomllib.loads(said[said.index("[lidar.mount]") : said.index("written:")])["lidar"]["mount"]
-    assert pasted == {"x": mount.x, "y": mount.y, "yaw": mount.yaw}
+    robot = tmp_path / "robot.toml"
+    robot.write_text("[lidar]\nmount = { x = 9.0, y = 9.0, yaw = 9.0, inverted = true }  # as in the first steps\n")
+    (command,) = [row for row in said.splitlines() if row.startswith("lumiloop config set ")]
+    assert parser.main([*command.split()[1:], "--config", str(robot)]) == console.OK
+    assert load(robot).lidar.mount == mount
     assert "scale" not in out.read_text()
     assert out.with_suffix(".png").stat().st_size > 10_000
     assert parser.main(["check", str(out)]) == console.OK

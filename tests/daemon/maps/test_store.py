@@ -10,7 +10,7 @@ import pytest
 
 from daemon.config.schema import MapConfig
 from daemon.devices.light_setup import Lights
-from daemon.maps.container import Damaged
+from daemon.maps.container import Damaged, Foreign
 from daemon.maps.generations import NEWEST, OTHERS
 from daemon.maps.initial_state import NoMap, new_state, recorded_start, started
 from daemon.maps.schema import digest_of
@@ -238,6 +238,16 @@ def test_a_map_that_somebody_has_put_there_is_loaded_where_there_is_no_other_and
     start = Store(tmp_path).load()
     assert start is not None
     assert start.content == content(seed=7)
+
+
+def test_a_map_that_somebody_has_put_there_is_found_by_its_identity(tmp_path: Path) -> None:
+    (tmp_path / "second floor.lumimap").write_bytes(content())
+    (tmp_path / "no map.lumimap").write_bytes(b"nothing")
+    store = Store(tmp_path)
+    assert {store.identity(one) for one in store.generations()} == {MAP, -1}
+    assert store.load_map(MAP).stored.meta.map_id == MAP
+    with pytest.raises(Foreign, match="there is no map 00000077"):
+        store.load_map(0x77)
 
 
 def test_what_is_no_map_among_what_somebody_has_put_there_hides_no_other(tmp_path: Path) -> None:

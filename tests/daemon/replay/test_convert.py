@@ -150,6 +150,15 @@ def test_what_cannot_be_converted_is_named(
     assert not (tmp_path / "b.log").exists()
 
 
+def test_a_log_that_is_read_as_it_is_needs_no_conversion(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_dat(tmp_path / "a.dat")
+    assert parser.main(["convert", str(tmp_path / "a.dat"), str(tmp_path / "b.log")]) == 0
+    assert parser.main(["convert", str(tmp_path / "b.log"), str(tmp_path / "c.log")]) == 1
+    said = capsys.readouterr().err
+    assert "b.log: a CARMEN log needs no conversion" in said
+    assert "lumiloop replay" in said
+
+
 @pytest.mark.parametrize("name", ["a.dat", "a.dat.gz"])
 def test_a_torn_end_costs_the_last_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
     ranges = write_dat(tmp_path / "whole.dat")

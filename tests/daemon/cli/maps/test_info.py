@@ -29,6 +29,30 @@ def test_info_says_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert found["bytes"] == path.stat().st_size
 
 
+def test_info_lists_the_maps_of_a_folder_newest_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = (tmp_path / f"map-00001234-0000000{number}.lumimap" for number in (1, 2))
+    other = tmp_path / "placed.lumimap"
+    for path in (first, second):
+        path.write_bytes(content())
+    other.write_bytes(content(Shape(map_id=0x77)))
+    for words in (["--set", f"map.folder={tmp_path}"], [str(tmp_path)]):
+        assert parser.main(["map", "info", *words]) == console.OK
+        head, *rows = capsys.readouterr().out.splitlines()
+        assert head.split() == ["map", "id", "saved", "submaps", "name", "file"]
+        assert [row.split()[0] for row in rows] == ["00001234", "00000077"]
+        assert rows[0].endswith(str(second)), "the newest file of a map"
+        assert "second floor, Süd" in rows[1]
+    assert parser.main(["map", "info", str(tmp_path), "--json"]) == console.OK
+    assert [one["map_id"] for one in json.loads(capsys.readouterr().out)["maps"]] == [0x1234, 0x77]
+    other.write_bytes(b"nothing")
+    assert parser.main(["map", "info", str(tmp_path)]) == console.FAILED
+    out, err = capsys.readouterr()
+    assert "00001234" in out
+    assert "placed.lumimap: " in err
+    assert parser.main(["map", "info", "--set", f"map.folder={tmp_path / 'none'}"]) == console.OK
+    assert "no map" in capsys.readouterr().out
+
+
 def test_verify_says_of_each_file_whether_it_is_good(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good, bad, torn = (tmp_path / f"{name}.lumimap" for name in ("good", "bad", "torn"))
     good.write_bytes(content())

@@ -104,7 +104,9 @@ async def test_orders_of_this_computer(tmp_path: Path, monkeypatch: pytest.Monke
         assert (await lumiloop("relocalise"))[1].startswith("search ended; state ")
         assert (await lumiloop("pause"))[1].startswith("paused: ")
         assert (await lumiloop("resume"))[1].startswith("pause ended; ")
-        assert [command.order for command in robot.commands[1:]] == [Order.RELOCALISE, Order.PAUSE, Order.RESUME]
+        assert (await lumiloop("reset"))[1].startswith("new map begun; stored maps remain; state ")
+        orders = [Order.RELOCALISE, Order.PAUSE, Order.RESUME, Order.RESET]
+        assert [command.order for command in robot.commands[1:]] == orders
         assert (await lumiloop("save-map"))[:2][1].startswith("map saved and read back")
         assert (await lumiloop("switch-map", "1a2b3c4d"))[0] == console.OK
         assert robot.switched == [0x1A2B3C4D]
