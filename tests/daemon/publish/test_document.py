@@ -58,13 +58,14 @@ def test_every_line_of_mbpoll_counts_from_0() -> None:
 def test_the_words_of_set_pose_are_those_of_the_command_block() -> None:
     """`docs/control.md` has them for mbpoll."""
     page = (DOCS / "control.md").read_text()
-    ((x, y, yaw, told),) = re.findall(r"SET_POSE to x (\S+) m, y (\S+) m, yaw (\S+) rad \| `([\d ]+)` \|", page)
+    line = r"-r 1000 \S+ ([\d ]+)\n +# request (\d): SET_POSE to x (\S+) m, y (\S+) m, yaw (\S+) rad"
+    ((told, number, x, y, yaw),) = re.findall(line, page)
     words = struct.pack(">8H", *map(int, told.split()))
     request, command, *pose = struct.unpack(">HHiii", words)
-    assert (request, command) == (1, CommandCode.SET_POSE)
+    assert (request, command) == (int(number), CommandCode.SET_POSE)
     assert pose == [round(1e4 * float(x)), round(1e4 * float(y)), round(1e6 * float(yaw))]
-    for name, number in re.findall(r"^\| ([A-Z_]+)\b.*`1 (\d+)` \|$", page, re.MULTILINE):
-        assert CommandCode[name] == int(number)
+    ((command, name),) = re.findall(r"-r 1000 \S+ 1 (\d+) +# request 1: (\w+)", page)
+    assert CommandCode[name] == int(command)
 
 
 def test_writing_makes_the_pages(tmp_path: Path) -> None:
