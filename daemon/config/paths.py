@@ -107,3 +107,13 @@ def can_be_made(folder: Path) -> bool:
 def maps_folder(configured: str) -> Path:
     """Folder of maps: ``map.folder`` where configured, otherwise beside the learned state."""
     return Path(configured) if configured else state_folder() / "maps"
+
+
+def stored_maps(configured: str) -> Path:
+    """Folder of maps for a command beside the daemon: as `maps_folder`, or the service's.
+
+    The service's is taken where this user has no folder of maps and may read that one, as with sudo.
+    """
+    own, service = maps_folder(configured), SERVICE_STATE / "maps"
+    readable = not configured and os.access(service, os.R_OK | os.X_OK)
+    return service if readable and not _there(own) else own

@@ -9,7 +9,7 @@ from enum import Enum, auto
 from pathlib import Path
 from typing import Final
 
-from daemon.config.paths import can_be_made, maps_folder
+from daemon.config.paths import can_be_made, stored_maps
 from daemon.config.schema import Config
 from daemon.system.folder_lock import locked
 
@@ -34,7 +34,7 @@ def look_at_maps(settings: Config) -> tuple[Maps, str]:
     be the very daemon of this configuration. BROKEN: no map is usable, or none can be stored. The store logs each
     unusable file. The folder often belongs to another user.
     """
-    folder = maps_folder(settings.map.folder)
+    folder = stored_maps(settings.map.folder)
     if not os.access(folder, os.F_OK):
         if not can_be_made(folder):
             text = f"{folder}: cannot be made by this user, maps cannot be kept; name another in `map.folder`"

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from daemon.config.paths import maps_folder
+from daemon.config.paths import stored_maps
 from daemon.config.schema import Config
 from daemon.maps.container import BadMap, pack
 from daemon.maps.generations import said
@@ -77,7 +77,7 @@ def keep(settings: Config, content: bytes, map_id: int) -> Path:
     """Store a map in the configured folder; `OSError`, with the remedy, where another process uses it."""
     if not settings.map.kept:
         raise OSError("`map.folder` is none; name a place with --out FILE")
-    store = Store(maps_folder(settings.map.folder))
+    store = Store(stored_maps(settings.map.folder))
     try:
         return store.save(content, map_id)
     except OSError as error:

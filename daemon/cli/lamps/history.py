@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from daemon.config.paths import maps_folder, stream_path
+from daemon.config.paths import stored_maps, stream_path
 from daemon.config.schema import Config
 from daemon.diagnosis.host import Heard, Host, standing
 from daemon.diagnosis.lamp_history import BadHistory, by_lamp, in_maps, load, merged, save
@@ -31,7 +31,7 @@ def tell(args: argparse.Namespace, host: Host) -> int:
     settings: Config = args.settings
     if not settings.map.kept and args.history is None:
         return console.fail("maps are not kept (`map.folder` is none), and so is nothing known of lamps", console.USAGE)
-    maps = maps_folder(settings.map.folder) if settings.map.kept else None
+    maps = stored_maps(settings.map.folder) if settings.map.kept else None
     path: Path = args.history or (maps.parent / FILE if maps is not None else Path(FILE))
     if args.history is not None and not path.parent.is_dir():
         return console.fail(

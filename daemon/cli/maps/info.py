@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.config.paths import maps_folder
+from daemon.config.paths import stored_maps
 from daemon.maps.container import BadMap
 from daemon.maps.generations import said
 from daemon.maps.schema import Stored, read, summary
@@ -25,7 +25,7 @@ LIST: Final = "{id:<8}  {saved:<23}  {submaps:>7}  {name:<20}  {file}"
 
 def folder(args: argparse.Namespace) -> int:
     """Lists the newest file of each map in the configured folder; returns the exit code."""
-    return _list(maps_folder(args.settings.map.folder), args.json)
+    return _list(stored_maps(args.settings.map.folder), args.json)
 
 
 def info(args: argparse.Namespace) -> int:

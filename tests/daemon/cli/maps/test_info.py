@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 
 from daemon.cli import parser
+from daemon.config import paths
+from daemon.config.schema import Config
+from daemon.maps import edit
 from daemon.system import console
 from tests.daemon.support.map_maker import Shape, content
 
@@ -51,6 +54,28 @@ def test_info_lists_the_maps_of_a_folder_newest_first(tmp_path: Path, capsys: py
     assert "placed.lumimap: " in err
     assert parser.main(["map", "info", "--set", f"map.folder={tmp_path / 'none'}"]) == console.OK
     assert "no map" in capsys.readouterr().out
+
+
+def test_the_maps_of_the_service_are_meant_where_this_user_keeps_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As with sudo beside the service: else an imported map would lie in root's own folder, which no daemon reads."""
+    monkeypatch.setattr(paths, "SERVICE_STATE", tmp_path / "service")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    own, service = tmp_path / "state" / "lumiloop" / "maps", tmp_path / "service" / "maps"
+    assert paths.stored_maps("") == own, "there is no service"
+    service.mkdir(parents=True)
+    assert paths.stored_maps("") == service
+    assert paths.stored_maps("/maps") == Path("/maps")
+    assert edit.keep(Config(), content(), 0x1234).parent == service
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lumiloop.toml").write_text("")
+    assert parser.main(["map", "info"]) == console.OK
+    assert str(service) in capsys.readouterr().out
+    own.mkdir(parents=True)
+    assert paths.stored_maps("") == own
+    assert paths.maps_folder("") == own, "the daemon's own rule is unchanged"
 
 
 def test_verify_says_of_each_file_whether_it_is_good(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
