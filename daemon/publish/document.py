@@ -123,7 +123,7 @@ whole snapshot of the last cycle.
 
 | You need | Input registers |
 | --- | --- |
-| health: state, reason, gravest fault, `flags` | 4 to 7 |
+| health: state, reason, most severe fault, `flags` | 4 to 7 |
 | heartbeat | 8 |
 | position and heading in the map | 18 to 23; as float32: {_mirrored("map_x", "map_yaw")} |
 | the same, predicted to the time of sending | 24 to 29; as float32: {_mirrored("predicted_x", "predicted_yaw")} |
