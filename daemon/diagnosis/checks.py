@@ -13,7 +13,7 @@ from typing import Final
 
 from daemon.config.endpoints import ANYBODY, AUTO, is_bus, parse_endpoint, subscription_port
 from daemon.config.loader import naming
-from daemon.config.paths import can_be_made, maps_folder, runtime_folder, state_folder, stream_path
+from daemon.config.paths import can_be_made, runtime_folder, state_folder, stored_maps, stream_path
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError, read_survey
 from daemon.diagnosis.configuration import implausible
@@ -276,7 +276,7 @@ def maps(case: Case) -> Iterator[Finding]:
 
 
 def _maps(settings: Config) -> Path | None:
-    return maps_folder(settings.map.folder) if settings.map.kept else None
+    return stored_maps(settings.map.folder) if settings.map.kept else None
 
 
 def survey(case: Case) -> Iterator[Finding]:

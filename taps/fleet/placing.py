@@ -16,7 +16,7 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
-from daemon.config.paths import maps_folder, state_folder
+from daemon.config.paths import state_folder, stored_maps
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError, dump, read_survey
 from daemon.maps.container import BadMap
@@ -244,7 +244,7 @@ def target_path(kind: str, settings: Config, survey: Path | None) -> Path:
     if kind == MAP:
         if not settings.map.kept:
             raise Refused("maps are not kept: `map.folder` is none")
-        return maps_folder(settings.map.folder).absolute()
+        return stored_maps(settings.map.folder).absolute()
     if survey is None and not settings.lights.survey:
         raise Refused("where should the survey go? set `lights.survey`, or name a file with --survey FILE")
     return (survey or Path(settings.lights.survey)).absolute()

@@ -14,6 +14,7 @@ from daemon.config import paths
 from daemon.config.schema import Config
 from daemon.maps import edit
 from daemon.system import console
+from taps.fleet.placing import MAP, target_path
 from tests.daemon.support.map_maker import Shape, content
 
 ROOT = Path(__file__).parents[4]
@@ -68,7 +69,7 @@ def test_the_maps_of_the_service_are_meant_where_this_user_keeps_none(
     service.mkdir(parents=True)
     assert paths.stored_maps("") == service
     assert paths.stored_maps("/maps") == Path("/maps")
-    assert edit.keep(Config(), content(), 0x1234).parent == service
+    assert edit.keep(Config(), content(), 0x1234).parent == service == target_path(MAP, Config(), None)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lumiloop.toml").write_text("")
     assert parser.main(["map", "info"]) == console.OK
