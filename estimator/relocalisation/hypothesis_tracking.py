@@ -252,9 +252,11 @@ class Watch(Trial):
         until_m: path length at its end, m.
         strikes: rejections since the last confirmation.
         terrain: search map of the latest check.
+        expected: whether dead reckoning had led to that pose, without any sign of a kidnapping.
     """
 
     until_m: float
+    expected: bool = False
     strikes: int = 0
     terrain: Terrain | None = None
 
@@ -277,6 +279,7 @@ class Question:
         leapt: whether the scene changed.
         opportunity: whether there was an opportunity for a kidnapping (`kidnap_opportunity`).
         share: inlier share in the local map.
+        odd: whether a match moved the pose by more than the prediction allows.
     """
 
     jumped: bool
@@ -285,6 +288,11 @@ class Question:
     leapt: bool = False
     opportunity: bool = True
     share: float = 0.0
+    odd: bool = True
+
+    def moved(self) -> bool:
+        """Whether a jump, a surprising match or a changed scene shows that the robot was moved."""
+        return self.jumped or self.leapt or self.odd
 
 
 @dataclass(slots=True, eq=False)

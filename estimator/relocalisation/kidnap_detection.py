@@ -146,7 +146,7 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
         doubt.fitted = max(doubt.fitted + 1, ROW if leapt else 0)
     else:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
-    if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt) and share > doubt.share - CHANGED:
+    if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt or doubt.again) and share > doubt.share - CHANGED:
         doubt.fitted, doubt.opportunity = 0, False  # the same view from the same position
     if doubt.question is not None and state.motion.t_mono - doubt.t_asked > GIVEN_UP_S:
         give_up(state, doubt.question)
@@ -256,7 +256,7 @@ def look(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) -> N
     against = local_map.contradicted(state.matching.local_map, frame.T_odom_lidar, frame.beams(), noise_m)
     share = match.inliers / max(1, match.queries)
     holds = global_scan_match.judged(match, share, against, told) is Verdict.HOLDS
-    asked = Question(doubt.jumped, holds, doubt.again, doubt.leapt, doubt.opportunity, share)
+    asked = Question(doubt.jumped, holds, doubt.again, doubt.leapt, doubt.opportunity, share, doubt.odd)
     doubt.settle()
     doubt.since = doubt.since or state.map.next_key
     older = [one for one in graph.settled() if one.first < doubt.since]
@@ -287,14 +287,14 @@ def answered(state: Owners, asked: Question, payload: object) -> None:
         return  # light gives the pose, relocalisation runs, or the map has restarted since
     doubt.question = None
     if elsewhere(asked, payload):
-        carried_off(state)
+        carried_off(state, dead_reckoning=state.motion.odometry and not asked.moved())
     elif payload.complete or not asked.opportunity:
         doubt.since = state.map.graph.cut_at = 0
     elif asked.again:  # a search that was cut off is no evidence: the pose is neither given up nor confirmed
         carried_off(state, dead_reckoning=state.motion.odometry)
     else:
-        doubt.fitted, doubt.odd, doubt.again, doubt.opportunity = ROW, True, True, True
-        doubt.leapt |= asked.leapt
+        doubt.fitted, doubt.again, doubt.opportunity = ROW, True, True
+        doubt.leapt, doubt.odd = doubt.leapt or asked.leapt, doubt.odd or asked.odd
 
 
 def elsewhere(asked: Question, looked: Looked) -> bool:
@@ -309,6 +309,8 @@ def elsewhere(asked: Question, looked: Looked) -> bool:
     excluded = here.verdict is Verdict.NO
     if not asked.opportunity:
         return excluded and not asked.holds and any(fit.verdict is Verdict.HOLDS for fit, _ in looked.fresh)
+    if here.verdict is Verdict.HOLDS and not asked.moved():
+        return False  # another place that fits too is no evidence against the prior
     own = here.share if excluded else max(here.share, asked.share)
     least = 0.0 if asked.leapt and excluded else max(global_scan_match.LEAST, own - BEHIND)
     rivals = any(fit.share >= least for fit, _ in looked.fresh)

@@ -55,7 +55,8 @@ def unresolved(state: Owners) -> bool:
     """
     doubt = state.relocalisation.suspicion
     earlier = doubt.opportunity or (doubt.question is not None and doubt.question.opportunity)
-    return not state.motion.odometry or earlier or since_match(state) or contradicted(state)
+    unseen = since_match(state) and not state.relocalisation.suspicion.contradiction.count
+    return not state.motion.odometry or earlier or unseen or mostly_excluded(state)
 
 
 def at_rest(state: Owners) -> bool:

@@ -63,7 +63,9 @@ def land(state: Owners, one: Hypothesis, alone: bool) -> None:
             P = R @ it.P @ R.T
             close = Found(it.key, it.T_submap_keyframe, P, it.share, it.against, it.residual_m, np.zeros(3))
             join(graph, at, replace(close, reason=LoopReason.PLACED))
-    bridge(graph, first)
+    agrees = bridge(graph, first)
+    if isinstance(parts.trial, Watch):
+        parts.trial.expected = agrees and state.relocalisation.dead_reckoning
     resettle(state, frame, fit.P, first)
     if stays:
         shift_map(state.map, se2.inverse(moved), 0)
@@ -71,16 +73,18 @@ def land(state: Owners, one: Hypothesis, alone: bool) -> None:
     relist(state.map, 0 if stays else since)
 
 
-def bridge(graph: SubmapGraph, first: int | None) -> None:
-    """Add odometry across the break as an edge that may be false, where the accepted pose agrees with it."""
+def bridge(graph: SubmapGraph, first: int | None) -> bool:
+    """Add odometry across the break as an edge that may be false, where the accepted pose agrees; returns whether."""
     told, graph.parts.bridge = graph.parts.bridge, None
     if told is None or first not in graph.submaps or told[0] not in graph.submaps:
-        return
+        return False
     key, T, P = told
     before, after = graph.submaps[key], graph.submaps[first]
     off = se2.between(T, se2.between(before.T_map_submap, after.T_map_submap))
-    if float(off @ invert3(P) @ off) < SURPRISE:
+    agrees = float(off @ invert3(P) @ off) < SURPRISE
+    if agrees:
         graph.constraints.add(key, after.key, T, P, True)
+    return agrees
 
 
 def resettle(state: Owners, frame: Keyframe, P_map: Array, first: int | None) -> None:

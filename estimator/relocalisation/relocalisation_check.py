@@ -60,5 +60,5 @@ def take_check(state: Owners, watch: Watch, payload: object) -> None:
             return
         if watch.alone:
             relocalisation.disown(state, watch.first, watch.since)
-        relocalisation.begin(state)
+        relocalisation.begin(state, dead_reckoning=watch.expected)
         state.relocalisation.unaligned |= watch.foreign_m is not None
