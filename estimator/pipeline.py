@@ -134,6 +134,12 @@ def see(state: State, scan: Scan, limits: Limits, refusal: Reason | None, lap: L
 
 def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
     """Eq. 14-15: update the pose by a match, the light filter by its motion, and the time offset."""
+    calibrated = state.settings.calibrate and state.motion.odometry
+    if calibrated and match.ok:
+        variance = float(state.motion.P[2, 2]) + 1.0 / max(float(match.information[2, 2]), 1e-9)
+        wheel_calibration.on_heading(
+            state.wheels, float(match.correction[2]), variance, float(state.motion.velocity[2])
+        )
     more = fuse(state.pose, state.motion, state.matching, match, state.settings.noise)
     if more is not None:  # the path too, or no loop could join submaps again
         state.map.graph.loosen(more, state.pose.T_odom_anchor)
@@ -313,11 +319,12 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
     """The estimate after this step; jobs wait for a cycle that updates the map."""
     motion, pose, map_ = state.motion, state.pose, state.map
     alignment, P = pose.alignment, pose.covariance(motion.T_odom_base, motion.P)
+    total = P + np.diag((0.0, 0.0, state.wheels.doubt))
     return StepResult(
         t_mono=motion.t_mono,
         T_odom_base=motion.T_odom_base,
         T_map_odom=pose.T_map_odom,
-        covariance=P + FLOOR,
+        covariance=total + FLOOR,
         velocity=motion.velocity.copy(),
         known_axes=known_axes(state, match, P),
         match=match,
@@ -339,7 +346,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         slow=state.wheels.told,
         jobs=state.jobs.take() if limits.level < DegradationLevel.NO_MAP else (),
         anew=state.matching.restarts,
-        protection=protection_level.bound(pose, motion, state.light, state.matching, P, state.wheels.mount_rad),
+        protection=protection_level.bound(pose, motion, state.light, state.matching, total, state.wheels.mount_rad),
     )
 
 

@@ -47,4 +47,5 @@ def correct(wheels: WheelCalibration, motion: Motion, matching: MatchMemory, pos
         Errors(one.x - off, one.P) for one in (wheels.errors, wheels.recent, wheels.former)
     )
     wheels.begun = wheels.waiting = None
+    wheels.jumped = 0.0
     return True

@@ -4,8 +4,9 @@ Five errors stay the same from one metre to the next: scale of distances, scale 
 deviation of the lidar mount from the configuration (yaw, lateral position; the longitudinal one acts like a skid). They
 are the state of a Kalman filter. One step compares the motion of ``T_odom_base`` between two matches with that of the
 wheels (A. Censi et al., IEEE Trans. Robotics 29, 2013). Wheels slip and matches slide, so a step has a Student-t
-likelihood. Errors can change, as when a mount is knocked: they are also estimated from recent steps alone, and these
-replace the former ones where both exclude each other.
+likelihood. Errors can change: they are also estimated from recent steps alone, and these replace the former ones where
+both exclude each other. A heading that jumps from one scan to the next shows that the robot was turned, or its mount.
+The next steps decide that; until then the jump is a doubt about the heading (`on_heading`).
 
 Large wheel errors correct the prediction (`corrected`), a large error of the mount corrects the mount
 (`mount_correction`).
@@ -55,6 +56,12 @@ It is twice the 99.99 % quantile of chi-square with 5 degrees of freedom: slip a
 """
 MOST_LEARNED: Final = 16.3
 """Largest squared Mahalanobis distance (99.9 % of chi-square with 3 degrees) of which the noise is learned."""
+SURPRISE: Final = 25.0
+"""Squared Mahalanobis distance of a heading correction that no wheel explains; as in `kidnap_detection`."""
+STAMP_S: Final = 0.1
+"""Sigma (s) of the time offset between lidar and wheels, before it is known."""
+USUAL, TAIL = 0.05, 9.0
+"""Share of a correction in their usual mean square, and the most multiple of that which it counts for."""
 SMALL: Final = 1e-4
 """Difference for the derivatives by the mount."""
 LARGE, SURE = 3.0, 2.5
@@ -87,6 +94,8 @@ class WheelCalibration:
         noise: learned factor on the variance of a step, which depends on lidar, stamps and floor.
         waiting: a match after the latest reading: instant and T_odom_base.
         mount: correction of the lidar mount so far (x, y, yaw); ``errors`` has what remains.
+        usual: mean square of heading corrections, rad^2.
+        jumped: heading jump (rad) of the matches that neither wheels nor mount explain yet, 0 without one.
         told: errors beyond what a sound robot has; None where there is none.
     """
 
@@ -104,7 +113,14 @@ class WheelCalibration:
     noise: float = FIRST_NOISE
     waiting: tuple[float, Array] | None = None
     mount: Array = field(default_factory=se2.identity)
+    usual: float = 0.0
+    jumped: float = 0.0
     told: SlowErrors | None = None
+
+    @property
+    def doubt(self) -> float:
+        """Variance (rad^2) of the heading after a jump: no more than that of the lidar mount, once steps show it."""
+        return min(self.jumped**2, mount_square(self.errors))
 
     @property
     def mount_rad(self) -> float:
@@ -112,6 +128,18 @@ class WheelCalibration:
         if self.told is None or not self.told.large[SlowError.MOUNT_YAW]:
             return 0.0
         return abs(float(self.errors.x[SlowError.MOUNT_YAW])) + LARGE * self.told.sigma[SlowError.MOUNT_YAW]
+
+
+def mount_square(errors: Errors) -> float:
+    """Mean square of the mount's yaw error, rad^2."""
+    return float(errors.x[SlowError.MOUNT_YAW] ** 2 + errors.P[SlowError.MOUNT_YAW, SlowError.MOUNT_YAW])
+
+
+def widened(errors: Errors, square: float) -> Errors:
+    """The errors with a variance (rad^2) added to the mount's yaw."""
+    P = errors.P.copy()
+    P[SlowError.MOUNT_YAW, SlowError.MOUNT_YAW] += square
+    return Errors(errors.x, P)
 
 
 def corrected(wheels: WheelCalibration, record: Odometry) -> Odometry:
@@ -164,6 +192,23 @@ def extend(wheels: WheelCalibration, delta: Array) -> None:
         J[1, k] += turned * px
         J[2, k] += 2.0 * more
     wheels.path = np.array((x + px, y + py, yaw + turn))
+
+
+def on_heading(wheels: WheelCalibration, off: float, variance: float, rate: float) -> None:
+    """Notice a heading jump: a correction ``off`` (rad) far outside its ``variance`` at the turn rate ``rate`` (rad/s).
+
+    The mount's yaw may have changed by as much; a jump back ends the doubt.
+    """
+    square = off * off
+    expected = variance + wheels.usual + (STAMP_S * rate) ** 2
+    least = LARGE * float(SOUND[SlowError.MOUNT_YAW])
+    if wheels.usual and abs(off) > least and square > SURPRISE * expected:
+        wheels.jumped += off
+        wheels.begun = wheels.waiting = None
+        wheels.errors, wheels.recent = widened(wheels.errors, square), widened(wheels.recent, square)
+        if abs(wheels.jumped) < least:
+            wheels.jumped = 0.0
+    wheels.usual += USUAL * (min(square, TAIL * wheels.usual) - wheels.usual) if wheels.usual else square
 
 
 def on_match(wheels: WheelCalibration, t_mono: float, T_odom_base: Array, complete: bool) -> None:
@@ -224,6 +269,8 @@ def compare(wheels: WheelCalibration, made: Array) -> None:
         wheels.errors = wheels.former = wheels.recent
     if wheels.steps % RECENT == 0:
         wheels.former, wheels.recent = wheels.errors, Errors()
+    if mount_square(wheels.errors) < SOUND[SlowError.MOUNT_YAW] ** 2:
+        wheels.jumped = 0.0
     wheels.told = judged(wheels.errors, wheels.mount) if wheels.steps >= FEWEST else None
     wheels.fix = wheels.errors.x[:3] if wheels.told is not None and wheels.told.wheels else np.zeros(3)
 
