@@ -344,6 +344,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         let_go=state.relocalisation.maps_dropped,
         lag=state.time_offset.told,
         slow=state.wheels.told,
+        jumped=math.sqrt(state.wheels.doubt),
         jobs=state.jobs.take() if limits.level < DegradationLevel.NO_MAP else (),
         anew=state.matching.restarts,
         protection=protection_level.bound(pose, motion, state.light, state.matching, total, state.wheels.mount_rad),

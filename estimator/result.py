@@ -344,6 +344,7 @@ class StepResult:
         let_go: number of stored maps dropped since the start, because the robot is nowhere in them.
         lag: time offset between the stamps of scans and odometry, None while it is not certain.
         slow: lasting errors of wheels and lidar mount, None while none is large.
+        jumped: sigma (rad) of the heading after a jump that wheels do not explain; ``covariance`` includes it.
         jobs: work for the background worker; each result returns as a record of a later step.
     """
 
@@ -372,4 +373,5 @@ class StepResult:
     let_go: int = 0
     lag: Lag | None = None
     slow: SlowErrors | None = None
+    jumped: float = 0.0
     jobs: tuple[Job, ...] = ()

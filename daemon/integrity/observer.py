@@ -251,10 +251,11 @@ class Observer:
         if self._P_complete is None or ordered or not self._mapped:
             self._P_complete = P
         sigma_m, sigma_rad = _growth(P, self._P_complete)
+        sigma_rad = max(sigma_rad, result.jumped)
         complete = match is not None and match.good and all(match.known)
         if complete and (odometry or (sigma_m <= VAGUE_M and sigma_rad <= VAGUE_RAD)):
             self._P_complete = P
-            return 0.0, 0.0
+            return 0.0, result.jumped
         return sigma_m, sigma_rad
 
 

@@ -94,7 +94,7 @@ class WheelCalibration:
         noise: learned factor on the variance of a step, which depends on lidar, stamps and floor.
         waiting: a match after the latest reading: instant and T_odom_base.
         mount: correction of the lidar mount so far (x, y, yaw); ``errors`` has what remains.
-        usual: mean square of heading corrections, rad^2.
+        usual: mean square of heading corrections, rad^2. rate: turn rate at the latest one, rad/s.
         jumped: heading jump (rad) of the matches that neither wheels nor mount explain yet, 0 without one.
         told: errors beyond what a sound robot has; None where there is none.
     """
@@ -114,6 +114,7 @@ class WheelCalibration:
     waiting: tuple[float, Array] | None = None
     mount: Array = field(default_factory=se2.identity)
     usual: float = 0.0
+    rate: float = 0.0
     jumped: float = 0.0
     told: SlowErrors | None = None
 
@@ -195,12 +196,14 @@ def extend(wheels: WheelCalibration, delta: Array) -> None:
 
 
 def on_heading(wheels: WheelCalibration, off: float, variance: float, rate: float) -> None:
-    """Notice a heading jump: a correction ``off`` (rad) far outside its ``variance`` at the turn rate ``rate`` (rad/s).
+    """Notice a heading jump: a correction ``off`` (rad) far outside its ``variance``, at a turn ``rate`` (rad/s).
 
-    The mount's yaw may have changed by as much; a jump back ends the doubt.
+    Between two matches, a time offset adds an error only by a change of the rate. The mount's yaw may have changed by
+    as much as the heading; a jump back ends the doubt.
     """
     square = off * off
-    expected = variance + wheels.usual + (STAMP_S * rate) ** 2
+    expected = variance + wheels.usual + (STAMP_S * (rate - wheels.rate)) ** 2
+    wheels.rate = rate
     least = LARGE * float(SOUND[SlowError.MOUNT_YAW])
     if wheels.usual and abs(off) > least and square > SURPRISE * expected:
         wheels.jumped += off
