@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimator import Odometry, SlowError, se2
-from estimator.fusion.wheel_calibration import SOUND, WheelCalibration, corrected, on_match, on_odometry
+from estimator.fusion.wheel_calibration import SOUND, WheelCalibration, corrected, on_heading, on_match, on_odometry
 from estimator.numerics.arrays import Array
 
 READING_S = 0.05
@@ -91,6 +91,44 @@ def test_a_mount_that_is_knocked_is_noticed_in_a_drive() -> None:
     play(wheels, errors(yaw=6.3), 6, 20.0, t=t)
     assert wheels.told is not None
     assert math.degrees(wheels.told.value[SlowError.MOUNT_YAW]) == pytest.approx(6.3, abs=0.5)
+
+
+def jump(wheels: WheelCalibration, deg: float, rate: float = 0.3) -> None:
+    """A heading jump after steady corrections of 0.1 deg at a steady turn rate (rad/s)."""
+    for k in range(20):
+        on_heading(wheels, math.radians(0.1 * (-1) ** k), math.radians(0.1) ** 2, rate)
+    on_heading(wheels, math.radians(deg), math.radians(0.1) ** 2, rate)
+
+
+@pytest.mark.parametrize("turned_deg", [-10.0, -3.0, 3.0, 6.0, 10.0])
+def test_a_heading_jump_is_a_doubt_until_steps_show_whether_the_mount_has_turned(turned_deg: float) -> None:
+    by_hand, knocked = WheelCalibration(), WheelCalibration()
+    for wheels, yaw in ((by_hand, 0.0), (knocked, turned_deg)):
+        t = play(wheels, errors(), 5, 30.0)
+        assert wheels.doubt == 0.0
+        jump(wheels, turned_deg)
+        assert math.sqrt(wheels.doubt) == pytest.approx(math.radians(abs(turned_deg)), rel=0.01)
+        play(wheels, errors(yaw=yaw), 6, 6.0, t=t)
+    assert math.degrees(math.sqrt(by_hand.doubt)) < 0.7
+    assert math.degrees(math.sqrt(knocked.doubt)) == pytest.approx(abs(turned_deg), abs=0.7)
+    assert math.degrees(knocked.errors.x[SlowError.MOUNT_YAW]) == pytest.approx(turned_deg, abs=0.7)
+
+
+def test_a_jump_back_ends_the_doubt() -> None:
+    wheels = WheelCalibration()
+    play(wheels, errors(), 5, 30.0)
+    jump(wheels, 8.0)
+    jump(wheels, -8.0)
+    assert wheels.doubt == 0.0
+
+
+@pytest.mark.parametrize(("deg", "before", "after"), [(1.4, 0.3, 0.3), (6.0, 0.0, 1.5)])
+def test_a_small_correction_or_one_of_a_changing_turn_rate_is_no_jump(deg: float, before: float, after: float) -> None:
+    """Wheels that are stamped 0.1 s late explain it."""
+    wheels = WheelCalibration()
+    jump(wheels, 0.1, before)
+    on_heading(wheels, math.radians(deg), math.radians(0.1) ** 2, after)
+    assert wheels.doubt == 0.0
 
 
 def test_a_correction_undoes_the_errors_of_the_wheels() -> None:

@@ -14,7 +14,7 @@ from estimator.mapping.loop_closure import take_answer
 from estimator.mapping.loop_verification import LoopSettings
 from estimator.mapping.submap_graph import SubmapGraph
 from estimator.measurements import Answer
-from estimator.relocalisation import relocalisation_check
+from estimator.relocalisation import relocalisation, relocalisation_check
 from estimator.relocalisation.global_scan_match import Fit, Looked, Verdict
 from estimator.relocalisation.hypothesis_tracking import Watch
 from estimator.state import State
@@ -53,6 +53,15 @@ def test_three_contradictions_without_one_that_holds_end_it(verdicts: list[Verdi
         relocalisation_check.take_check(state, seen, looked(verdict))
     assert (state.map.parts.detached is not None) == lost
     assert (state.map.parts.trial is None) == lost
+
+
+@pytest.mark.parametrize("expected", [True, False])
+def test_a_revoked_pose_to_which_odometry_had_led_is_carried_on_by_it(expected: bool) -> None:
+    state, seen, _ = watched()
+    seen.expected = expected
+    for _ in range(3):
+        relocalisation_check.take_check(state, seen, looked(Verdict.NO))
+    assert relocalisation.dead_reckons(state) is expected
 
 
 def test_an_answer_to_a_place_given_up_meanwhile_counts_for_nothing() -> None:
