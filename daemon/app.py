@@ -184,7 +184,7 @@ class Daemon:
             log.info("stopping")
             self._keep_sample_clock()
             await _stop(tasks.get("cycle"))
-            saving = asyncio.create_task(self.autosaver.finish(stop.is_set()), name="map at the stop")
+            saving = asyncio.create_task(self.autosaver.finish(stop.is_set()), name="map at shutdown")
             for name in (
                 "lidar",
                 *tasks,
@@ -229,18 +229,22 @@ class Daemon:
             assert store is not None
             store.refuse(error)
             if self._estimator.localise:
-                raise NoMap(f"map {map_id:08x} cannot be used, and `map.localise` is true; start again") from error
+                raise NoMap(
+                    f"map {map_id:08x} cannot be used, but `map.localise` is true; restart the daemon"
+                ) from error
             self._estimator.start = None
             self._estimator.load()
             self.cycle.map_id = self._environment.draw_map_id()
             self.autosaver.without_start()
-            self.maps.ask(map_id, lambda why: log.warning("a new map is begun: %s", why) if why else None, patient=True)
+            self.maps.ask(
+                map_id, lambda why: log.warning("the daemon begins a new map: %s", why) if why else None, patient=True
+            )
 
     def _remember(self) -> None:
         """Put the stored pose of the previous run into the inbox as a command to the estimator."""
         pose = None if self.last_pose is None else self.last_pose.of_map(self.cycle.map_id)
         if pose is not None:
-            log.info("the robot was last at x %.2f m, y %.2f m, heading %.1f deg", *pose[:2], math.degrees(pose[2]))
+            log.info("the last stored pose is x %.2f m, y %.2f m, heading %.1f deg", *pose[:2], math.degrees(pose[2]))
             self.cycle.inbox.put_command(Command(self._environment.clock.now(), Order.REMEMBERED, np.array(pose)))
 
     def _autosaver(self, settings: Config, lights: Lights | None, snapshots: SnapshotBuilder) -> MapAutosaver:
@@ -391,6 +395,6 @@ async def _stop(task: asyncio.Task[Any] | None) -> None:
     task.cancel()
     await asyncio.wait([task], timeout=QUIET_S)
     if not task.done():
-        log.warning("%s does not stop", task.get_name())
+        log.warning("task %s does not stop", task.get_name())
     elif not task.cancelled() and (error := task.exception()) is not None:
-        log.error("%s failed while stopping", task.get_name(), exc_info=error)
+        log.error("task %s failed while stopping", task.get_name(), exc_info=error)

@@ -31,12 +31,12 @@ class Reason(Enum):
     ITERATION_CAP = "iteration cap reached before convergence"
     OSCILLATING = "oscillates between two sets of pairs"
     TOO_FEW_POINTS = "too few valid beams"
-    TOO_FEW_PAIRS = "too few beams found a partner in the map"
-    NO_MAP = "nothing to match against yet"
+    TOO_FEW_PAIRS = "too few beams have a correspondence in the map"
+    NO_MAP = "the local map is still empty"
     REJECTED = "residual or correction implausible"
-    MALFORMED = "not a scan: lengths, bearings, times, mount or noise cannot be those of a sweep"
-    LATE = "older than the scan before it, or than the way that is remembered"
-    PASSED_OVER = "not matched: no time for it, or a person has said pause"
+    MALFORMED = "not a valid scan: lengths, bearings, times, mount or noise are impossible"
+    LATE = "older than the previous scan, or than the motion history"
+    PASSED_OVER = "not matched: no computing time left, or paused"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -68,7 +68,7 @@ class _JumpingSelector(selectors.DefaultSelector):
         ready = super().select(0)
         if not ready:
             if timeout is None:
-                raise RuntimeError("virtual time stands still: no timer is pending and nothing is ready to run")
+                raise RuntimeError("virtual time cannot advance: no timer is pending and no task is ready to run")
             if timeout > 0:
                 self.virtual_now += timeout
         return ready

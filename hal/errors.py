@@ -14,7 +14,10 @@ from __future__ import annotations
 
 from typing import Final
 
-KEPT_AWAY: Final = "not permitted", "the service's unit allows no such device: systemctl edit it, DeviceAllow="
+KEPT_AWAY: Final = (
+    "not permitted",
+    ("the service unit denies this device; allow it with `systemctl edit` and DeviceAllow="),
+)
 """Problem and remedy of EPERM: the file's permissions allow the access (else EACCES), the service unit denies it."""
 
 

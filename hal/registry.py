@@ -60,5 +60,5 @@ def lidar_factory(name: str) -> LidarFactory:
             try:
                 return cast(LidarFactory, point.load())
             except (ImportError, AttributeError) as error:
-                raise DeviceRefused(name, f"its package does not load: {error}", "reinstall it") from error
-    raise DeviceRefused(name, "no such lidar driver", f"there are: {', '.join(names())}")
+                raise DeviceRefused(name, f"its package cannot be loaded: {error}", "reinstall it") from error
+    raise DeviceRefused(name, "no such lidar driver", f"available: {', '.join(names())}")

@@ -100,14 +100,14 @@ def token_for(bind: str, write: bool, file: Path | None) -> str | None:
     try:
         text = file.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise TokenRefused(f"{file}: the token cannot be read: {error}") from None
+        raise TokenRefused(f"{file}: cannot read the token: {error}") from None
     if not SHORTEST_TOKEN <= len(text) <= LONGEST_TOKEN or not text.isascii() or not text.isprintable():
         raise TokenRefused(
-            f"{file}: a token is {SHORTEST_TOKEN} to {LONGEST_TOKEN} letters and digits on one line; make one with "
-            f"`openssl rand -hex 16 > {file}`"
+            f"{file}: not a token of {SHORTEST_TOKEN} to {LONGEST_TOKEN} letters and digits on one line; make "
+            f"one with `openssl rand -hex 16 > {file}`"
         )
     if file.stat().st_mode & 0o077:
-        raise TokenRefused(f"{file}: others on this computer may read it; `chmod 600 {file}`")
+        raise TokenRefused(f"{file}: other users of this computer can read the file; run `chmod 600 {file}`")
     return text
 
 

@@ -49,12 +49,12 @@ def locator(text: str) -> str:
     """
     if "/" in text:
         if (protocol := text.partition("/")[0]) not in PROTOCOLS:
-            raise BadEndpoint(f"{text}: {protocol!r} is no protocol; there are {', '.join(PROTOCOLS)}")
+            raise BadEndpoint(f"{text}: {protocol!r} is not a protocol; available: {', '.join(PROTOCOLS)}")
         return text
     try:
         host, port = parse_endpoint(text)
     except ValueError as error:
-        raise BadEndpoint(f"{error}; or name one as Zenoh does, tls/HOST:PORT") from None
+        raise BadEndpoint(f"{error}; or give an address in Zenoh's form, tls/HOST:PORT") from None
     return f"tcp/{in_url(host)}:{port}"
 
 
@@ -102,7 +102,7 @@ def _check_files(result: zenoh.Config) -> None:
             except OSError as error:
                 raise BadEndpoint(f"{path} ({key}): cannot be read: {error.strerror}") from None
             if b"-----BEGIN " not in content:
-                raise BadEndpoint(f"{path} ({key}): no certificate or key in PEM form")
+                raise BadEndpoint(f"{path} ({key}): the file has no certificate or key in PEM form")
 
 
 def error_text(error: Exception) -> str:
@@ -131,7 +131,7 @@ async def open_session(router: str, file: Path | None = None, say: Say = console
                 reported = True
             await asyncio.sleep(RETRY_S)
     if reported:
-        say(f"the router at {router} is there")
+        say(f"connected to the router at {router}")
     try:
         yield session
     finally:
@@ -149,7 +149,11 @@ async def watch_router(session: zenoh.Session, router: str, on_router: OnRouter,
         if bool(session.info.routers_zid()) == present:
             continue
         present = not present
-        say(f"the router at {router} is back" if present else f"the router at {router} has gone; waiting for it")
+        say(
+            f"connected to the router at {router} again"
+            if present
+            else f"the connection to the router at {router} is lost; waiting for it"
+        )
         on_router(present)
 
 

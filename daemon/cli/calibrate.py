@@ -69,7 +69,7 @@ def _lights(args: argparse.Namespace, drive: Drive) -> int:
     given = read_survey(args.survey, drive.profile) if args.survey else drive.survey
     if not given.lamps:
         raise SurveyError(
-            f"{drive.path}: recorded without a survey; name one with --survey, or make one: lumiloop survey"
+            f"{drive.path}: the recording has no survey; name one with --survey, or make one with `lumiloop survey`"
         )
     strengths = heard(drive)
     start = np.array(args.start) if args.start else found_frame(given, strengths)
@@ -98,9 +98,7 @@ def found_frame(given: Survey, strengths: Heard) -> Array:
         z = float(np.median([lamp.z for lamp in given.lamps]))
         return align(given, survey(strengths, given.receiver, given.depth, z).found.survey)
     except (Unaligned, TooLittle) as error:
-        raise type(error)(
-            f"{error}; say where the drive began in the survey's frame with --start X Y DEGREES"
-        ) from error
+        raise type(error)(f"{error}; give the start pose in the survey's frame with --start X Y DEGREES") from error
 
 
 def in_survey(found: Calibrated, rows: Rows) -> Rows:
@@ -116,10 +114,10 @@ def report(found: Calibrated, residuals: ResidualMap) -> str:
     x, y, yaw = found.T_survey_drive
     used, total = int(found.used.sum()), len(found.used)
     lines = [
-        f"{used} strengths used of {total} (the rest out of plain view, blocked, or contradicting)",
-        f"residual of ln strength, rms: {before:.4f} before, {after:.4f} after",
-        f"the drive began at x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(yaw):.2f} deg of the survey",
-        f"residual map: {residuals.noise:.4f} left unexplained, one sigma of ln",
+        f"{used} RSS values used of {total} (the rest is outside the field of view, occluded or inconsistent)",
+        f"residual of ln RSS, rms: {before:.4f} before, {after:.4f} after",
+        f"start pose of the drive: x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(yaw):.2f} deg in the survey's frame",
+        f"residual map: {residuals.noise:.4f} remaining residual, one sigma of ln RSS",
         "",
         f"{'lamp':>6} {'parameter':<12} {'before':>10} {'after':>10} {'sigma':>9}",
         *(line(e) for e in found.estimates if not e.name.startswith("frame") and e.lamp_id not in found.untouched),
@@ -127,18 +125,17 @@ def report(found: Calibrated, residuals: ResidualMap) -> str:
     if found.untouched:
         lines += [
             "",
-            "hardly seen, nothing but the gain common to all was changed: lamps "
-            + ", ".join(map(str, found.untouched)),
+            "too few measurements, only the common gain was changed: lamps " + ", ".join(map(str, found.untouched)),
         ]
     if not found.converged:
-        lines += ["", "the fit had not settled when it was stopped: take these figures with care"]
+        lines += ["", "the fit has not converged; check these values before use"]
     return "\n".join(lines) + "\n"
 
 
 def line(e: Estimate) -> str:
     """Returns the text line of one parameter."""
     lamp = "all" if e.lamp_id is None else str(e.lamp_id)
-    told = "" if e.told else "  not told by this drive"
+    told = "" if e.told else "  not determined by this drive"
     return f"{lamp:>6} {e.name:<12} {e.before:>10.4f} {e.after:>10.4f} {e.sigma:>9.4f} {e.unit}{told}".rstrip()
 
 
@@ -146,8 +143,8 @@ def notes(drive: Drive, found: Calibrated) -> list[str]:
     """Returns the head comments of the written survey."""
     before, after = found.rms()
     return [
-        f"Calibrated from {drive.path.name}: residual of ln strength {before:.4f} before, {after:.4f} after (rms).",
-        "power_w is what this receiver makes of each lamp; sigma is one sigma of its ln.",
+        f"Calibrated from {drive.path.name}: residual of ln RSS {before:.4f} before, {after:.4f} after (rms).",
+        "power_w is each lamp's power as this receiver measures it; sigma is one sigma of its ln.",
     ]
 
 
@@ -156,7 +153,7 @@ def remarks(found: Calibrated) -> dict[int, str]:
     said: dict[int, list[str]] = {}
     for e in found.estimates:
         if e.lamp_id is not None and e.lamp_id not in found.untouched:
-            said.setdefault(e.lamp_id, []).append(f"{e.name} +-{e.sigma:.3f}" if e.told else f"{e.name} not told")
+            said.setdefault(e.lamp_id, []).append(f"{e.name} +-{e.sigma:.3f}" if e.told else f"{e.name} not determined")
     return {lamp: ", ".join(words) for lamp, words in said.items()}
 
 
@@ -177,7 +174,7 @@ def calibrate_wheels(drive: Drive, args: argparse.Namespace) -> int:
     found = findings(fit, args.odometry, args.lidar_mount)
     config = with_mount(drive.config, fit) if args.lidar_mount else drive.config
     sys.stdout.write("\n".join([*found, *(configuration_lines(config) if args.lidar_mount else ())]) + "\n")
-    head = [f"Configuration of the drive {drive.path.name}, calibrated from it (lumiloop calibrate).", *found]
+    head = [f"Configuration of drive {drive.path.name}, calibrated from it (lumiloop calibrate).", *found]
     loader.write(args.out, config, head, force=args.force)
     sys.stdout.write(f"written: {args.out}\n{draw_wheels(fit, args.out.with_suffix('.png'))}\n")
     return console.OK

@@ -21,7 +21,7 @@ def main(args: argparse.Namespace) -> int:
     args.config = args.file or args.config
     if (file := find_config(args).file) is None:
         return console.fail(
-            "there is no configuration file: name one, or make one: lumiloop config init", console.USAGE
+            "no configuration file was found; name one, or make one with `lumiloop config init`", console.USAGE
         )
     wrong, gone = list[tuple[int, str]](), frozenset[str]()
     settings: Config | None

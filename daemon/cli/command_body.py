@@ -30,7 +30,7 @@ def config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="configuration file; default: the first found (config show)"
     )
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrule one key")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override one key")
     parser.add_argument("--print-config", action="store_true", help="print the resolved configuration and stop")
 
 

@@ -20,7 +20,7 @@ def main(args: argparse.Namespace) -> int:
         return console.fail(_replayable(args.source) or str(error))
     for sentence in scans.report.sentences():
         console.say(f"{args.source}: {sentence}")
-    console.say(f"{len(scans.stamps)} scans of {scans.ranges.shape[1]} beams into {args.log}")
+    console.say(f"{len(scans.stamps)} scans of {scans.ranges.shape[1]} beams written to {args.log}")
     return console.OK
 
 

@@ -26,7 +26,9 @@ def examine(args: argparse.Namespace, host: Host) -> int:
     try:
         settings = loader.load(find_config(args).file, list(args.set))
     except loader.ConfigError as error:
-        wrong = Finding("configuration", Level.FIX, str(error), "mend it; nothing else can be judged before")
+        wrong = Finding(
+            "configuration", Level.FIX, str(error), "correct it; the other checks need a valid configuration"
+        )
         _tell([wrong], args.json)
         return console.USAGE
     case = Case(settings, args.source.file, host, host.listen(args.stream or stream_path(settings.name)))
@@ -49,7 +51,7 @@ def _tell(found: list[Finding], as_json: bool) -> None:
     first = next((finding for finding in found if finding.level is Level.FIX), None)
     count = sum(finding.level is Level.FIX for finding in found)
     if first is None:
-        lines.append("nothing has to be fixed")
+        lines.append("no problem was found")
     else:
-        lines.append(f"{count} to fix; first: {first.about}: {first.remedy}")
+        lines.append(f"{count} to fix. Fix first: {first.about}: {first.remedy}")
     sys.stdout.write("\n".join(lines) + "\n")

@@ -15,12 +15,13 @@ from enum import IntEnum
 from typing import Any, Final
 
 from daemon.cli.reports.output import print_report
+from daemon.cli.status_table import WORDS as STATUS_WORDS
 from daemon.config import loader
 from daemon.config.schema import Config
 from daemon.health.faults import FAULTS
 from daemon.health.reasons import REASONS
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
-from daemon.publish.modbus import holding, integrity_block, registers
+from daemon.publish.modbus import holding, integrity_block, parts_block, registers, timing_block
 from daemon.publish.modbus.points import Layout, Point
 from daemon.publish.modbus.requests import BLOCKS
 from daemon.system.console import FAILED, OK, fail
@@ -44,11 +45,11 @@ _BITS: Final = (
     ("bit of `witnesses`", integrity_block.WITNESSES),
 )
 _PORTS: Final = (
-    (Config().modbus.port, "MODBUS_PORT", "where the daemon answers Modbus, UDP and TCP", "`modbus.port` sets another"),
-    (8090, "WEB_PAGE", "where `lumiloop view` serves the web page", "`--port` sets another"),
-    (8765, "FOXGLOVE", "where `lumiloop foxglove` serves the Foxglove app", "`--listen` sets another"),
-    (9464, "METRICS", "where `lumiloop metrics` serves Prometheus", "`--listen` sets another"),
-    (7447, "ZENOH_ROUTER", "where `lumiloop fleet` and `lumiloop ros2` look for it", "`--router` sets another"),
+    (Config().modbus.port, "MODBUS_PORT", "Modbus server of the daemon on UDP and TCP", "`modbus.port` changes it"),
+    (8090, "WEB_PAGE", "web page of `lumiloop view`", "`--port` changes it"),
+    (8765, "FOXGLOVE", "server of `lumiloop foxglove` for the Foxglove app", "`--listen` changes it"),
+    (9464, "METRICS", "Prometheus metrics of `lumiloop metrics`", "`--listen` changes it"),
+    (7447, "ZENOH_ROUTER", "Zenoh router of `lumiloop fleet` and `lumiloop ros2`", "`--router` changes it"),
 )
 """Default ports."""
 _MOST: Final = 12
@@ -99,10 +100,10 @@ def main(args: argparse.Namespace) -> int:
         )
         return OK if found else FAILED
     if not found:
-        return fail(f"{asked}: nothing of that name or number; {_hint(asked, everything)}", FAILED)
+        return fail(f"{asked}: no such name or number; {_hint(asked, everything)}", FAILED)
     sys.stdout.write("\n\n".join(str(entry) for entry in found[:_MOST]) + "\n")
     if len(found) > _MOST:
-        sys.stdout.write(f"\nand {len(found) - _MOST} more; ask more exactly\n")
+        sys.stdout.write(f"\nand {len(found) - _MOST} more; give a kind or a longer name\n")
     return OK
 
 
@@ -110,14 +111,14 @@ def _hint(asked: str, everything: Sequence[Entry]) -> str:
     kind = asked.lower()
     for entry in everything:
         if entry.numbers and kind in (entry.kind, entry.kind.rpartition(" ")[2]):
-            return f"name a number, too, as in: {kind} {entry.numbers[0]}"
+            return f"add a number, as in: {kind} {entry.numbers[0]}"
     names = {entry.name.lower() for entry in everything}
     near = [] if asked[-1:].isdigit() else difflib.get_close_matches(asked.lower(), names, n=3, cutoff=0.7)
     near = near or sorted(name for name in names if _inside(asked.lower(), name))[:3]
     if near:
         return f"did you mean {' or '.join(near)}?"
     kinds = "a key, a state, a fault, a reason, a command, a register, a bit or a port"
-    return f"ask for {kinds}, as in: fault 302, TRACKING, bind"
+    return f"name {kinds}, as in: fault 302, TRACKING, bind"
 
 
 def _inside(asked: str, name: str) -> bool:
@@ -133,7 +134,7 @@ def entries() -> Iterator[Entry]:
             "configuration key", option.path, range(0), f"{option.description} ({option.kind}; default {default})"
         )
     for path, remedy in loader.MOVED.items():
-        yield Entry("configuration key of earlier versions", path, range(0), "there is no such key any more", remedy)
+        yield Entry("configuration key of earlier versions", path, range(0), "this key has been removed", remedy)
     yield from _meanings("reason", REASONS)
     yield from _meanings("fault", FAULTS)
     yield from _names("state", STATES)
@@ -141,6 +142,11 @@ def entries() -> Iterator[Entry]:
     yield from _names("link use", USES)
     yield from _names("loop reason", LOOPS)
     yield from _names("command", COMMANDS)
+    yield from _names("component", parts_block.PARTS)
+    yield from _names("thread", parts_block.THREADS)
+    yield from _names("stage", timing_block.STAGES)
+    for name, text in STATUS_WORDS.items():
+        yield Entry("word of `lumiloop status`", name, range(0), text)
     for port, name, text, remedy in _PORTS:
         yield Entry("port", name, range(port, port + 1), text, remedy)
     yield from _registers()
@@ -194,8 +200,8 @@ def _frames() -> Iterator[Entry]:
 def _elsewhere(point: Point) -> str:
     """Returns the point's text, with the command to run in place of a reference to a table."""
     kind = "link use" if point.name.endswith("_use") else point.name
-    text = point.text.replace("Bits, see below", "Bits; what each means: lumiloop explain bit NUMBER")
-    return text.replace("See below", f"What each means: lumiloop explain {kind} NUMBER")
+    text = point.text.replace("Bits, see below", "Bits; for their meaning: lumiloop explain bit NUMBER")
+    return text.replace("See below", f"For the meaning: lumiloop explain {kind} NUMBER")
 
 
 def _one(code: IntEnum) -> range:
@@ -205,11 +211,21 @@ def _one(code: IntEnum) -> range:
 def find(asked: str, everything: Sequence[Entry]) -> list[Entry]:
     """Returns the entries of a number or name, of one kind if the first words name it.
 
-    A table's name gives its keys.
+    A table's name gives its keys, too.
     """
     kind, _, last = asked.lower().rpartition(" ")
     of_kind = [entry for entry in everything if kind in entry.kind]
     if last.isascii() and last.isdigit():
         return [entry for entry in of_kind if int(last) in entry.numbers]
-    exact = [entry for entry in of_kind if entry.name.lower() == last]
-    return exact or [entry for entry in of_kind if f".{last}." in f".{entry.name.lower()}."]
+    named = _named(asked.lower().split(), everything)
+    within = [entry for entry in of_kind if f".{last}." in f".{entry.name.lower()}."]
+    return [*named, *(entry for entry in within if entry not in named)]
+
+
+def _named(words: Sequence[str], everything: Sequence[Entry]) -> list[Entry]:
+    """Returns the entries with the longest name that the last words form, of the kind of the words before them."""
+    for cut in range(len(words)):
+        kind, name = " ".join(words[:cut]), " ".join(words[cut:])
+        if found := [entry for entry in everything if kind in entry.kind and entry.name.lower() == name]:
+            return found
+    return []

@@ -59,7 +59,9 @@ def map_server(args: argparse.Namespace) -> None:
     described, cells = load(args.yaml)
     area = float((cells == 0).sum()) * described.resolution**2
     if area > MOST_FREE_M2:
-        raise BadMapServer(f"{args.yaml}: has {area:.0f} m2 of free floor; at most {MOST_FREE_M2:.0f} can be imported")
+        raise BadMapServer(
+            f"{args.yaml}: the map has {area:.0f} m2 of free ground; at most {MOST_FREE_M2:.0f} can be imported"
+        )
     args.described = described, cells
 
 
@@ -67,8 +69,8 @@ def moment(args: argparse.Namespace) -> None:
     """Finds the recording with the moment ``args.time`` in ``args.log``, as ``args.found``."""
     folder = args.log or recordings_folder(FLIGHT)
     if args.log is None and not is_folder(folder):
-        looked = f"nothing is recorded in {folder}, nor in {SERVICE_STATE / FLIGHT}"
-        raise NoMoment(f"{looked}; name a recording, or run with --record {folder} --last 10")
+        looked = f"no recording was found in {folder} or {SERVICE_STATE / FLIGHT}"
+        raise NoMoment(f"{looked}; name a recording, or start the daemon with --record {folder} --last 10")
     args.found = find(spans(folder), args.time, folder)
 
 

@@ -59,7 +59,7 @@ def main(args: argparse.Namespace) -> int:
             _write(args, hall, plan, receiver, survey is None)
         if survey is None and (short := plan.short_of(goals)):
             return console.fail(
-                f"{short}: plan parts of the hall apart, or lower the goals (--share, --links, --accuracy)"
+                f"{short}: plan parts of the hall separately, or lower the goals (--share, --links, --accuracy)"
             )
     except (NoHall, SurveyError, OutputRefused, ValueError) as error:
         return console.fail(str(error))
@@ -68,18 +68,21 @@ def main(args: argparse.Namespace) -> int:
 
 def _wrong(args: argparse.Namespace) -> str:
     if not HEADROOM_M < args.height <= HIGHEST_M:
-        return f"--height {args.height:g}: name metres above the floor, more than {HEADROOM_M:g}, {HIGHEST_M:g} at most"
+        return (
+            f"--height {args.height:g}: out of range; give metres above the ground, more than {HEADROOM_M:g}, "
+            f"{HIGHEST_M:g} at most"
+        )
     metres = args.accuracy, args.reach, args.spacing
     if not (all(0.0 < m < math.inf for m in metres) and 0.0 < args.share <= 100.0 and args.links >= 1):
-        return "--accuracy, --reach, --spacing, --links have to be above 0 and finite, --share above 0 and at most 100"
+        return "--accuracy, --reach, --spacing, --links must be above 0 and finite, and --share above 0 and at most 100"
     if not 0.0 < args.width <= WIDEST_M:
-        return f"--width {args.width:g}: name metres above 0, {WIDEST_M:g} at most"
+        return f"--width {args.width:g}: out of range; give metres above 0, {WIDEST_M:g} at most"
     if args.start is not None and not all(math.isfinite(m) for m in args.start):
-        return "--start: name two finite numbers, metres in the map frame"
+        return "--start: give two finite numbers, metres in the map frame"
     if args.lamps is not None and args.survey is not None:
-        return "--lamps says how many are to be hung, --survey judges those that hang: name one of them"
+        return "--lamps plans new lamps, and --survey assesses installed ones; use only one of them"
     if args.lamps is not None and args.lamps < 1:
-        return "--lamps: name one or more"
+        return "--lamps: give a number of 1 or more"
     return ""
 
 
@@ -89,7 +92,7 @@ def _hung(args: argparse.Namespace) -> Survey | None:
         return None
     survey = read_survey(args.survey, profile_of(args.settings.photodiode))
     if not survey.lamps:
-        raise NoHall(f"{args.survey}: names no lamps")
+        raise NoHall(f"{args.survey}: the survey has no lamps")
     return survey
 
 
@@ -106,7 +109,7 @@ def fitting_of(receiver: Receiver, height: float) -> Fitting:
         NoHall: the lamps would not be above the receiver.
     """
     if height - receiver.z < HEADROOM_M:
-        raise NoHall(f"lamps at {height:g} m are not above the receiver at {receiver.z:g} m: give --height")
+        raise NoHall(f"lamps at {height:g} m are not above the receiver at {receiver.z:g} m; correct --height")
     return Fitting(height - receiver.z, Lamp(0, 0, 0.0, 0.0, 0.0).order + receiver.order, receiver.half_fov_rad)
 
 
@@ -118,22 +121,25 @@ def report(hall: Hall, plan: Plan, goals: Goals, fitting: Fitting) -> str:
     counts = np.bincount(np.minimum(plan.links, goals.links), minlength=goals.links + 1)
     fewer = ", ".join(f"{count} see {number}" for number, count in enumerate(counts[:-1]) if count)
     lines = [
-        f"floor: {area:.0f} m2 where a robot can be, {len(hall.places)} places {hall.step:.2f} m apart",
+        f"accessible area: {area:.0f} m2, {len(hall.places)} positions {hall.step:.2f} m apart",
         *hall.reached.lines(hall.pictured),
-        f"laser alone: a blind axis (over {100 * KNOWN_SIGMA_M:.0f} cm) at {_percent(blind)} of them",
+        f"lidar solution: a degenerate direction (sigma over {100 * KNOWN_SIGMA_M:.0f} cm) at "
+        f"{_percent(blind)} of the positions",
         f"lamps: {len(plan.lamps)}, one for every {area / max(1, len(plan.lamps)):.1f} m2; each reaches "
         f"{fitting.reach:.1f} m",
-        f"links: {_percent(plan.links >= goals.links)} of places see {goals.links} or more"
+        f"links: {_percent(plan.links >= goals.links)} of positions see {goals.links} or more"
         + (f"; of {len(plan.links)}, {fewer}" if fewer else ""),
-        f"light alone: {deviations(plan.light_sigma)}",
-        f"laser and light: {deviations(plan.sigma)}; a blind axis is left at {_percent(still)}",
+        f"light solution: {deviations(plan.light_sigma)}",
+        f"lidar and light: {deviations(plan.sigma)}; a degenerate direction remains at {_percent(still)}",
     ]
     if not plan.possible.all():
-        never = "cannot have that whatever hangs there: corners and narrow places, or lamps are too low"
-        lines.append(f"{_percent(~plan.possible)} of places {never}")
+        never = "cannot reach the goals with any lamps: they are corners or narrow, or the lamps are too low"
+        lines.append(f"{_percent(~plan.possible)} of the positions {never}")
     if goals.exact is None:
         share = 100.0 * float(plan.reached)
-        lines.append(f"{goals.links} links and {100 * goals.accuracy:.0f} cm from light alone: {share:.1f} % of places")
+        lines.append(
+            f"{goals.links} links and {100 * goals.accuracy:.0f} cm by the light solution: {share:.1f} % of positions"
+        )
     return "".join(f"{line}\n" for line in lines)
 
 
@@ -154,7 +160,7 @@ def deviations(sigma: Array) -> str:
     middle = f"median {100.0 * median:.1f} cm" if median <= OPEN_M else f"median over {OPEN_M:g} m"
     if most <= OPEN_M:
         return f"{middle}, 95 % within {100.0 * most:.1f} cm"
-    return f"{middle}, over {OPEN_M:g} m at {_percent(sigma > OPEN_M)} of places"
+    return f"{middle}, over {OPEN_M:g} m at {_percent(sigma > OPEN_M)} of positions"
 
 
 def _quantiles(sigma: Array) -> tuple[float, float]:
@@ -172,13 +178,15 @@ def _write(args: argparse.Namespace, hall: Hall, plan: Plan, receiver: Receiver,
             Lamp(number, code, round(float(x), 3), round(float(y), 3), args.height, sigma_ln=0.05)
             for number, (code, (x, y)) in enumerate(zip(codes, xy, strict=True), 1)
         )
-        notes = [f"Planned for {args.map.name}: where lamps are to hang, not where they do; survey them when they do."]
+        notes = [
+            f"Planned for {args.map.name}. These are planned positions; survey the lamps after they are installed."
+        ]
         folder.write("lights.toml", dump(Survey(lamps, receiver, depth=profile.depth), notes).encode())
-        sys.stdout.write(f"{folder.path / 'lights.toml'}: the lamps, with a code each\n")
+        sys.stdout.write(f"{folder.path / 'lights.toml'}: the lamps with their codes\n")
         if math.isfinite(apart):
-            sys.stdout.write(f"codes are used again, {apart:.1f} m apart at least\n")
+            sys.stdout.write(f"codes are reused, {apart:.1f} m or more apart\n")
     if (drawn := plan_plot.draw(hall, plan)) is None:
-        console.say(f"pictures need matplotlib: {how_to_install('plot')}")
+        console.say(f"plots need matplotlib: {how_to_install('plot')}")
     else:
         folder.write("plan.png", drawn)
-        sys.stdout.write(f"{folder.path / 'plan.png'}: links, accuracy, blind axes\n")
+        sys.stdout.write(f"{folder.path / 'plan.png'}: links, accuracy, degenerate directions\n")

@@ -49,7 +49,7 @@ async def _look(places: dict[str, LidarPlace], quiet: bool) -> list[Found]:
     findings: list[Found] = []
     for device, place in places.items():
         if not quiet:
-            sys.stderr.write(f"looking at {device} ...\n")
+            sys.stderr.write(f"probing {device} ...\n")
         bus = is_bus(device)
         finding: Found = (
             await probe_bus(open_bus, device.removeprefix("i2c+"))

@@ -60,7 +60,7 @@ def command(
     except (HalError, OutputRefused, warmup.CannotLoad) as error:
         return console.fail(str(error))
     if outcome.stopped:
-        return console.fail(f"{outcome.stopped}; what was computed until then is in {folder.path}", _code(outcome))
+        return console.fail(f"{outcome.stopped}; the results up to there are in {folder.path}", _code(outcome))
     return _verdict(outcome)
 
 
@@ -79,12 +79,12 @@ def _verdict(outcome: Outcome) -> int:
         sys.stderr.write(f"replay: {sentence}\n")
     if not len(rerun.ledger):
         sources = "a scan or light" if rerun.blocks else "a scan"
-        return console.fail(f"{source.path}: {source.kind} without {sources} that gave a pose")
+        return console.fail(f"{source.path}: {source.kind} does not contain {sources} that gave a pose")
     if rerun.comparison.differ:
         first = rerun.comparison.first
         sys.stderr.write(f"replay: {rerun.comparison.differ} cycles differ from the recorded run; {first}\n")
     if outcome.journal is not None and outcome.journal.missed():
-        return console.fail("none of the matches asked for is in the log; the other results are written")
+        return console.fail("the log has none of the requested matches; the other results are written")
     log_s, run_s = rerun.t_mono - rerun.t_first, outcome.seconds["run"]
     speed = f"{log_s:.1f} s of log in {run_s:.1f} s ({log_s / run_s:.0f} x real time)"
     online = rerun.ledger.online()

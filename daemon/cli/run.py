@@ -44,8 +44,8 @@ processor time and lines of the log.
 """
 
 SECOND: Final = (
-    "what it has open, sensors, ports, maps, this one cannot have; stop it (systemctl stop lumiloop), or give this one "
-    "a `name`, devices and ports of its own"
+    "two daemons cannot share sensors, ports and maps; stop the other one (systemctl stop lumiloop), or give "
+    "this one its own `name`, devices and ports"
 )
 
 
@@ -60,7 +60,7 @@ def main(args: argparse.Namespace) -> int:
     log.info("%s: configuration %s%s", settings.name, args.source, overruled)
     log.debug("every value:\n%s", loader.dump(settings).rstrip())
     for other in streams_served(settings.name):  # this may be intended, but each device has one owner
-        log.warning("a daemon named %s runs on this computer already (%s): %s", settings.name, other, SECOND)
+        log.warning("a daemon with the name %s runs on this computer already (%s); %s", settings.name, other, SECOND)
     recorder = None
     give_back()
     try:
@@ -86,8 +86,8 @@ def main(args: argparse.Namespace) -> int:
 def _wait_before_anew() -> None:
     """Delays the service manager's restart after a failed start; a stop ends the wait (SIGTERM's default action)."""
     if managed():
-        notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=cannot start, see the log; tried again soon")
-        log.info("the next start is tried in %.0f s", ANEW_S)
+        notify(f"EXTEND_TIMEOUT_USEC={EXTEND_US}", "STATUS=cannot start, see the log; the daemon tries again soon")
+        log.info("the daemon tries to start again in %.0f s", ANEW_S)
         time.sleep(ANEW_S)
 
 
@@ -109,12 +109,12 @@ def _whereabouts(settings: Config, record: Path | None, stream: Path | None) -> 
     modbus = f"Modbus on {settings.bind} port {settings.modbus.port} (UDP and TCP)"
     said = [modbus if settings.modbus.port else "no Modbus on the network"]
     said += [f"Modbus RTU on {settings.modbus.serial}"] if settings.modbus.serial else []
-    said += [f"answering {', '.join(settings.allow)} only"] if settings.allow else []
+    said += [f"only for {', '.join(settings.allow)}"] if settings.allow else []
     said += [f"pose datagrams to {', '.join(settings.pose.receivers)}"] if settings.pose.receivers else []
     said += [f"stream {stream}"] if stream is not None else []
     used = "map from" if settings.map.localise else "maps in"
-    said += [f"{used} {maps_folder(settings.map.folder)}"] if settings.map.kept else ["no map is kept"]
-    said += [f"recording into {record}"] if record is not None else []
+    said += [f"{used} {maps_folder(settings.map.folder)}"] if settings.map.kept else ["maps are not stored"]
+    said += [f"recording to {record}"] if record is not None else []
     return f"{'; '.join(said)}; Ctrl-C or SIGTERM stops"
 
 

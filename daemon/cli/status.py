@@ -51,7 +51,7 @@ def address_of(text: str | None, settings: Config | None) -> tuple[str, int]:
     if not text:
         host, port = (settings.bind, settings.modbus.port) if settings is not None else ("127.0.0.1", DEFAULT_PORT)
         if port == 0:
-            raise NoAnswer("the configuration switches Modbus off (modbus.port is 0); name HOST:PORT")
+            raise NoAnswer("Modbus is disabled in the configuration (modbus.port is 0); name HOST:PORT")
         return _ANY_HOST.get(host, host), port
     host, colon, port_text = text.rpartition(":")
     if text.startswith("[") and text.endswith("]"):
@@ -59,7 +59,7 @@ def address_of(text: str | None, settings: Config | None) -> tuple[str, int]:
     if not colon or (":" in host and not host.startswith("[")):
         return text, DEFAULT_PORT
     if not (port_text.isascii() and port_text.isdigit() and 0 < int(port_text) < 1 << 16):
-        raise NoAnswer(f"{text}: {port_text!r} is not a port; write HOST or HOST:PORT, as in 192.168.0.10:1502")
+        raise NoAnswer(f"{text}: {port_text!r} is not a port; give HOST or HOST:PORT, as in 192.168.0.10:1502")
     return host.strip("[]") or "127.0.0.1", int(port_text)
 
 

@@ -14,7 +14,30 @@ from daemon.publish.modbus.points import U16, Value
 from daemon.snapshot import GUESSED, LISTED_LINKS, LightFix, LinkUse, Stage, State
 
 _TOP: Final = U16.span[1] / 10_000  # where ages and sigmas, 16 bits of 0.1 ms or 0.1 mm, saturate
-_GUESS: Final = "  (a guess: the place is not known)"
+_GUESS: Final = "  (unconfirmed pose)"
+WORDS: Final = {
+    "map pose": "pose in the map frame: x and y in m, yaw counter-clockwise from the x axis",
+    "sigma": "one standard deviation of x, y and yaw",
+    "hypotheses": "number of poses that are possible during relocalisation",
+    "lights": "number of lamps in view, and the lamp with the largest RSS",
+    "light fix": "state of the light filter, number of lamps used, and age of the light",
+    "lamp": "number of the lamp in the survey",
+    "code": "number of the code that the lamp sends",
+    "use": "use of the lamp; `lumiloop explain` with the shown word gives its meaning",
+    "light pose": "light solution: the pose by light and odometry, without the lidar",
+    "odom pose": "pose in the odom frame, which never jumps",
+    "speed": "velocity in the base frame: ahead, to the left, and turning",
+    "map": "identity of the map, and the number of jumps of the map pose",
+    "loops": "number of loop closures, and the keyframes of the latest one",
+    "scans": "valid scans per second, and missed scans since the start",
+    "devices": "configured devices; NOT OK: the device delivers no valid data",
+    "running": "time since the start of the daemon, and restarted, failed or hanging components",
+    "snapshot": "number and time of the published snapshot",
+    "STALLED": "no new snapshot arrives: the daemon or its cycle has stopped",
+    "RSS": "received signal strength: amplitude of the modulated photocurrent of a lamp",
+    "residual": "received RSS of a lamp minus the expected RSS, in percent of the expected RSS",
+}
+"""Words of the table that are no names of registers, with their meaning."""
 
 
 def _fix(reading: Reading) -> str | None:
@@ -34,7 +57,7 @@ def as_table(reading: Reading, stalled: bool) -> str:
     """Returns the reading as a table: state, pose, faults and lamps first; one line a subject."""
     flags = registers.decode_bits(registers.FLAGS, reading["flags"])
     starting = reading["state"] == State.STARTING  # no cycle yet: there are no new snapshots, and devices have no state
-    still = "  (STANDS STILL: no new snapshot)" if stalled and not starting else ""
+    still = "  (STALLED: no new snapshot)" if stalled and not starting else ""
     rows = [
         ("state", _state(reading["state"]) + still),
         ("reason", _meaning("reason", reading["reason"])),
@@ -99,7 +122,7 @@ def _name(table: type[IntEnum], number: Value) -> str:
     try:
         return table(int(number or 0)).name
     except ValueError:
-        return f"unknown to this reader ({number})"
+        return f"unknown to this version ({number})"
 
 
 def _meaning(subject: str, number: Value) -> str:
@@ -110,7 +133,7 @@ def _meaning(subject: str, number: Value) -> str:
     from daemon.health.reasons import REASONS
 
     meanings: Mapping[Any, tuple[str, str]] = REASONS if subject == "reason" else FAULTS
-    text, remedy = meanings.get(int(number), ("unknown to this reader", "use the daemon's own version of this command"))
+    text, remedy = meanings.get(int(number), ("unknown to this version", "use the version of the daemon"))
     return f"{number}: {text}" + (f" ({remedy})" if remedy else "")
 
 
@@ -146,7 +169,7 @@ def _left_out(reading: Reading) -> str:
         return said
     number = reading["stall_in"]
     where = "" if number is None else f" in {_name(Stage, number)}"
-    return f"{said}; stood still {stalls:g} times, latest {_number(reading['stall'], 's', 3)}{where}"
+    return f"{said}; {stalls:g} stalls, latest {_number(reading['stall'], 's', 3)}{where}"
 
 
 def _trust(reading: Reading) -> list[tuple[str, str]]:
@@ -157,13 +180,13 @@ def _trust(reading: Reading) -> list[tuple[str, str]]:
     if reading["protection"] is None:
         text = "none"
     else:
-        names = {"laser_bounds": "laser", "light_bounds": "light", "wheels_bound": "wheels"}
+        names = {"laser_bounds": "lidar", "light_bounds": "light", "wheels_bound": "odometry"}
         rests = ", ".join(name for bit, name in names.items() if bits[bit])
         text = f"{_number(reading['protection'], 'm', 3)}, {_angle(reading['protection_yaw'])} ({rests})"
     limit = reading["alert_limit"]
     alert = "" if limit is None else f"{'  ALERT' if bits['alert'] else ''}, limit {limit:.3f} m"
     places = reading["places"]
-    return [("bound", text + alert), *([] if places is None else [("places", f"{places:g} fit")])]
+    return [("protection", text + alert), *([] if places is None else [("hypotheses", f"{places:g}")])]
 
 
 def _lights(reading: Reading) -> list[tuple[str, str]]:
@@ -182,7 +205,7 @@ def _lights(reading: Reading) -> list[tuple[str, str]]:
     rows.append(("", f"sigma {_triple(reading, names, 'm', '')}"))
     links = list(_links(reading))
     if links:
-        rows.append(("links", f"{'lamp':>6} {'code':>5} {'strength':>12} {'residual':>9}  use"))
+        rows.append(("links", f"{'lamp':>6} {'code':>5} {'RSS':>12} {'residual':>9}  use"))
     for link in links:
         lamp = "-" if link["lamp"] is None else link["lamp"]
         residual = "-" if link["residual"] is None else f"{100.0 * math.expm1(link['residual']):+.1f} %"
@@ -218,7 +241,7 @@ def _devices(word: Value, starting: bool) -> str:
     bits = registers.decode_bits(registers.DEVICES, word)
     fitted = [name for name in ("lidar", "adc", "odometry") if bits[f"{name}_fitted"]]
     if starting and fitted:
-        return f"{', '.join(fitted)}: told from the first cycle on"
+        return f"{', '.join(fitted)}: no data before the first cycle"
     return ", ".join(f"{name} {'ok' if bits[f'{name}_ok'] else 'NOT OK'}" for name in fitted) or "none configured"
 
 

@@ -17,9 +17,7 @@ from hal.errors import HalError
 def main(args: argparse.Namespace) -> int:
     """Runs the command; returns the exit code."""
     if args.out.exists() and not args.force:
-        return console.fail(
-            f"{args.out} exists: name another file with --out, or ask for it to be replaced with --force"
-        )
+        return console.fail(f"{args.out} exists already; name another file with --out, or replace it with --force")
     keys = tuple(override.partition("=")[0].strip() for override in args.set)
     try:
         drive = read_drive(args.source, args.settings, Given(args.config is not None, keys))
@@ -28,7 +26,8 @@ def main(args: argparse.Namespace) -> int:
         found = survey(heard(drive), drive.survey.receiver, drive.survey.depth, args.height)
         sys.stdout.write(report(found, args.height))
         head = [
-            f"Lamps located by the drive {drive.path.name}; the frame is that of its map: the robot's start, x ahead.",
+            f"Lamps located by the drive {drive.path.name}. The frame is that of its map: origin at the start "
+            "pose, x ahead.",
             "Height: " + ("as given." if args.height else "from the drive." if found.height_told else "a guess."),
         ]
         write_survey(args.out, found.found.survey, head, remarks(found), force=args.force)
@@ -50,9 +49,12 @@ def report(found: Surveyed, height: float | None) -> str:
         place = f"{lamp.x:>8.3f} {lamp.y:>8.3f} {lamp.z:>6.2f}"
         lines.append(f"{lamp.lamp_id:>6} {lamp.code:>5} {place} {spread:>8.3f} {lamp.power_w:>8.3f} {near:>10.2f}")
     if height is None and not found.height_told:
-        lines.append("this drive does not tell the lamps' height; z is a guess: measure one lamp and give --height")
+        lines.append(
+            "the drive does not determine the height of the lamps, and z is a default; measure one lamp and give "
+            "--height"
+        )
     if found.left_out:
-        lines.append("heard too seldom or too weakly to be placed: codes " + ", ".join(map(str, found.left_out)))
+        lines.append("too few or too weak measurements for a position: codes " + ", ".join(map(str, found.left_out)))
     return "\n".join(lines) + "\n"
 
 

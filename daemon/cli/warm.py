@@ -30,9 +30,9 @@ def main(args: argparse.Namespace) -> int:
     if warmth.compiled and warmth.unwritten:
         return console.fail(f"kernels compiled in {warmth.seconds:.1f} s; {warmup.EACH} ({warmth.unwritten})")
     if not warmth.compiled:
-        console.say(f"an earlier start has compiled the kernels; they load in {warmth.seconds:.1f} s")
+        console.say(f"the kernels were compiled before; they load in {warmth.seconds:.1f} s")
     else:
-        damaged = f"; {warmth.damaged} of their files were damaged" if warmth.damaged else ""
+        damaged = f"; {warmth.damaged} damaged files were replaced" if warmth.damaged else ""
         console.say(f"kernels compiled in {warmth.seconds:.1f} s{damaged}")
     return console.OK
 

@@ -39,7 +39,8 @@ def main(args: argparse.Namespace) -> int:
             sys.stdout.write(moment_report.report(told, utc, span.path.name, wide, second, span.remarks))
         if rerun.comparison.differ:
             console.say(
-                f"the replay is not the recorded run ({rerun.comparison.first}): other software, or records are lost"
+                f"the replay differs from the recorded run ({rerun.comparison.first}): the software differs, "
+                "or records are lost"
             )
         if args.out is not None:
             _draw(args.out, told, max(utc, told[chosen(told, utc, second, wide).cycle].utc), rerun)
@@ -51,7 +52,7 @@ def main(args: argparse.Namespace) -> int:
 def _try(out: Path) -> None:
     """Checks before the replay that a plot can be made and written; raises `OutputRefused`."""
     if find_spec("matplotlib") is None:
-        raise OutputRefused(f"pictures need matplotlib: {how_to_install('plot')}")
+        raise OutputRefused(f"plots need matplotlib: {how_to_install('plot')}")
     Folder(out.parent).demand(out.name)
 
 

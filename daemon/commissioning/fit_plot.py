@@ -10,7 +10,7 @@ import numpy as np
 from daemon.system.extras import how_to_install
 from estimator.calibration import Calibrated, Surveyed, WheelFit
 
-_MISSING: Final = f"no picture: matplotlib is not installed ({how_to_install('plot')})"
+_MISSING: Final = f"no plot: matplotlib is not installed ({how_to_install('plot')})"
 
 
 def draw_calibration(found: Calibrated, path: Path) -> str:
@@ -63,8 +63,8 @@ def draw_wheels(fit: WheelFit, path: Path) -> str:
         turn.set(xlabel="step of the drive")
         for axes in (way, turn):
             axes.axhline(0.0, color="k", linewidth=0.5)
-    grid[0, 0].set_ylabel("wheels less laser, mm")
-    grid[1, 0].set_ylabel("wheels less laser, deg")
+    grid[0, 0].set_ylabel("odometry minus lidar, mm")
+    grid[1, 0].set_ylabel("odometry minus lidar, deg")
     grid[0, 0].legend()
     return _save(canvas, path)
 
@@ -82,5 +82,5 @@ def _save(canvas: Any, path: Path) -> str:
     try:
         canvas.savefig(path)
     except OSError as error:
-        return f"no picture: cannot write {path}: {error.strerror}"
+        return f"no plot: cannot write {path}: {error.strerror}"
     return f"picture: {path}"

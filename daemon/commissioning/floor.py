@@ -71,12 +71,12 @@ def read_hall(path: Path, spacing: float, robot: Robot = ANYWHERE) -> Hall:
         cells, resolution, origin, drive = _of_map(path)
         return hall_of(cells, resolution, origin, spacing, robot, drive)
     if path.is_dir():
-        raise NoHall(f"{path}: is a folder; name the picture in it, its YAML, or a map file, *.lumimap")
+        raise NoHall(f"{path}: this is a folder; name the image in it, its YAML file, or a map file, *.lumimap")
     if not path.exists():
-        raise NoHall(f"{path}: no such file; name map_server's picture, its YAML, or a map file, *.lumimap")
+        raise NoHall(f"{path}: no such file; name a map_server image, its YAML file, or a map file, *.lumimap")
     yaml = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
     if not yaml.exists():
-        raise NoHall(f"{path}: {yaml.name}, which says how large a pixel is, is not beside it")
+        raise NoHall(f"{path}: {yaml.name} with the size of a pixel is missing; put it beside the image")
     try:
         described, cells = load(yaml)
     except BadMapServer as error:

@@ -63,12 +63,12 @@ class Plan:
         """Returns why the goals are not reached where they could be, or why lamps are missing; empty otherwise."""
         count = len(self.lamps)
         if goals.exact is not None:
-            return "" if count >= goals.exact else f"only {count} spots where one more lamp would tell anything"
+            return "" if count >= goals.exact else f"only {count} positions remain where another lamp improves the plan"
         share = self.reached / max(1e-9, float(self.possible.mean()))
         if share >= goals.share or not self.possible.any():
             return ""
-        why = f"limit of {goals.most} lamps" if count >= goals.most else "no further spot helps"
-        return f"goal NOT reached: {why}; {100.0 * share:.1f} % of the places where it could be"
+        why = f"limit of {goals.most} lamps" if count >= goals.most else "no further position improves the plan"
+        return f"goal NOT reached ({why}); {100.0 * share:.1f} % of the positions that can reach it"
 
     @property
     def light_sigma(self) -> Array:

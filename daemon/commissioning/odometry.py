@@ -20,10 +20,10 @@ _MOUNT: Final = (Wheel.MOUNT_X, Wheel.MOUNT_Y, Wheel.MOUNT_YAW)
 def findings(fit: WheelFit, odometry: bool, mount: bool) -> list[str]:
     """Returns the requested results of the fit as text lines."""
     pair = [f"{1e3 * way:.1f} mm {_deg(turn):.3f} deg" for way, turn in (fit.before, fit.after)]
-    lines = [f"{fit.steps} steps; wheels against laser, rms: {pair[0]} before, {pair[1]} after"]
+    lines = [f"{fit.steps} steps; odometry minus lidar, rms: {pair[0]} before, {pair[1]} after"]
     if odometry:
         lines += [_line(fit, which) for which in _ODOMETRY]
-        lines.append("multiply the wheels' radii by `scale`, and the track by `scale / turn`")
+        lines.append("multiply the wheel radii by `scale`, and the track by `scale / turn`")
     return lines + [_line(fit, which) for which in _MOUNT if mount]
 
 
@@ -50,7 +50,11 @@ def configuration_lines(config: Config) -> list[str]:
 def fit_drive(drive: Drive) -> WheelFit:
     """Fits odometry to the lidar poses over the whole drive; raises `DataInvalid`."""
     if len(drive.readings) < 2:
-        raise DataInvalid(str(drive.path), "no odometry in it", "record with odometry.port set and readings sent to it")
+        raise DataInvalid(
+            str(drive.path),
+            "the recording has no odometry",
+            "set `odometry.port`, send readings to it, and record again",
+        )
     stamps, first = np.unique(drive.readings[:, 0], return_index=True)
     wheels = drive.readings[first, 1:].copy()
     wheels[:, 2] = np.unwrap(wheels[:, 2])
@@ -61,7 +65,7 @@ def fit_drive(drive: Drive) -> WheelFit:
     try:
         return fit_wheels(said, on_base(base, drive.mount), drive.mount)
     except ValueError as error:
-        raise DataInvalid(str(drive.path), str(error), "turn on the spot and drive some curves, both ways") from error
+        raise DataInvalid(str(drive.path), str(error), "turn on the spot, and drive curves to both sides") from error
 
 
 def _line(fit: WheelFit, which: Wheel) -> str:
@@ -69,7 +73,7 @@ def _line(fit: WheelFit, which: Wheel) -> str:
     unit = {Wheel.DRIFT: " deg/m", Wheel.MOUNT_YAW: " deg", Wheel.MOUNT_X: " m", Wheel.MOUNT_Y: " m"}.get(which, "")
     if unit.startswith(" deg"):
         value, sigma = _deg(value), _deg(sigma)
-    told = "" if fit.told[which] else "  not told by this drive"
+    told = "" if fit.told[which] else "  not determined by this drive"
     return f"{which.name.lower():<10} {value:>9.4f} +-{sigma:.4f}{unit}{told}"
 
 

@@ -58,12 +58,12 @@ def figure(hall: Hall, plan: Plan) -> Any:
     steps = colormaps["viridis"].resampled(_MOST_LINKS + 1)
     counted = np.minimum(plan.links, _MOST_LINKS)
     seen = _places(links, hall, plan, window, counted, steps, (-0.5, _MOST_LINKS + 0.5))
-    links.set_title("Lamps\nthat each place sees", fontsize="medium")
+    links.set_title("Lamps\nin view of each position", fontsize="medium")
     scale = canvas.colorbar(seen, ax=links, label="number of lamps", ticks=range(_MOST_LINKS + 1), **bar)
     scale.ax.set_yticklabels([*map(str, range(_MOST_LINKS)), f"{_MOST_LINKS}+"])
     centimetres = np.minimum(100.0 * plan.light_sigma, _WORST_CM)
     known = _places(accuracy, hall, plan, window, centimetres, colormaps["cividis_r"], (0.0, _WORST_CM))
-    accuracy.set_title("Standard deviation\nby light alone, worse axis", fontsize="medium")
+    accuracy.set_title("Standard deviation\nof the light solution, worse axis", fontsize="medium")
     canvas.colorbar(known, ax=accuracy, label="standard deviation, cm", extend="max", **bar)
     _axes(blind, hall, plan, window)
     for panel in (links, accuracy, blind):
@@ -73,7 +73,7 @@ def figure(hall: Hall, plan: Plan) -> Any:
     lines, labels = blind.get_legend_handles_labels()
     if hall.reached.left_out.any():
         lines.append(Patch(color=str(_LEFT_OUT)))
-        labels.append("floor that is left out")
+        labels.append("excluded area")
     canvas.legend(lines, labels, loc="outside lower center", ncols=2, fontsize="small")
     return canvas
 
@@ -181,8 +181,8 @@ def _axes(axes: Any, hall: Hall, plan: Plan, window: Window) -> None:
     """Plots lines along the axes that are not known: by the lidar alone, and with lamps."""
     _walls(axes, hall, window)
     for info, colour, label in (
-        (plan.walls, _LASER, "not known by the lidar alone"),
-        (plan.walls + plan.light, _BOTH, "not known by lidar and light"),
+        (plan.walls, _LASER, "degenerate for the lidar alone"),
+        (plan.walls + plan.light, _BOTH, "degenerate for lidar and light"),
     ):
         sigma, way = worst(info)
         at = sigma > KNOWN_SIGMA_M
@@ -190,7 +190,7 @@ def _axes(axes: Any, hall: Hall, plan: Plan, window: Window) -> None:
         ends = hall.in_map(np.concatenate((hall.places[at] - half, hall.places[at] + half)))
         ends = np.stack((*np.split(ends, 2), np.full_like(half, np.nan)), axis=1)
         x, y = ends.reshape(-1, 2).T
-        axes.plot(x, y, color=colour, lw=1.5, label=f"{label}: {100.0 * at.mean():.1f} % of places")
+        axes.plot(x, y, color=colour, lw=1.5, label=f"{label}: {100.0 * at.mean():.1f} % of positions")
     _lamps(axes, hall, plan, window)
     _numbers(axes, hall, plan)
     axes.set_title(f"Directions not known to\n{100 * KNOWN_SIGMA_M:.0f} cm; lamp numbers", fontsize="medium")

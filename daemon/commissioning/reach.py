@@ -69,14 +69,14 @@ class Reached(NamedTuple):
         said = []
         if self.apart_m2 >= LEAST_AREA_M2:
             said.append(
-                f"left out: {self.apart_m2:.0f} m2 that a robot {self.width:.2f} m wide cannot reach from {self.since}"
+                f"excluded: {self.apart_m2:.0f} m2 that a robot {self.width:.2f} m wide cannot reach from {self.since}"
             )
         if self.behind_m2 >= LEAST_AREA_M2:
-            said.append(f"left out: {self.behind_m2:.0f} m2 that the lidar has seen only through glass")
+            said.append(f"excluded: {self.behind_m2:.0f} m2 that the lidar measured only through glass")
         if not self.since and self.regions > 1:
-            said.append(f"{self.regions} areas are not connected: name --start X Y to leave out what cannot be reached")
+            said.append(f"{self.regions} areas are not connected; give --start X Y to exclude what cannot be reached")
         if pictured and self.since:
-            said.append("a picture does not show glass: draw glass as a wall, or plan with a map file, *.lumimap")
+            said.append("an image does not show glass; draw glass as a wall, or plan with a map file, *.lumimap")
         return said
 
 
@@ -114,9 +114,7 @@ def reached(free: Mask, frame: Frame, robot: Robot, drive: Drive | None = None) 
     """
     open_room, regions = _regions(free, frame.cell, robot.width)
     if not regions.any():
-        raise NoRoom(
-            "no place in the plan is free enough for a robot; is the picture the right one, or `negate` wrong?"
-        )
+        raise NoRoom("the plan has no free position for a robot; check the image and its `negate`")
     count = len(np.unique(regions[open_room]))
     since, seeds = _seeds(robot, drive)
     nothing = np.zeros_like(open_room)
@@ -174,7 +172,7 @@ def _seeds(robot: Robot, drive: Drive | None) -> tuple[str, Array | None]:
         x, y = robot.start
         return f"({x:g}, {y:g})", np.array([robot.start])
     if drive is not None and len(drive.path):
-        return "where it has driven", drive.path
+        return "its recorded path", drive.path
     return "", None
 
 
@@ -189,8 +187,8 @@ def _connected(regions: npt.NDArray[np.int32], frame: Frame, seeds: Array, requi
     if required and off.min() > NEAREST_M:
         x, y = frame.in_map(frame.cell * (np.array([[here[1][0], here[0][0]]]) + 0.5))[0]
         raise NoRoom(
-            f"--start {seeds[0, 0]:g} {seeds[0, 1]:g}: the robot does not fit there; the nearest place is "
-            f"{x:.2f} {y:.2f}, in the map frame"
+            f"--start {seeds[0, 0]:g} {seeds[0, 1]:g}: the robot does not fit there; the nearest possible "
+            f"position is {x:.2f} {y:.2f}, in the map frame"
         )
     found = np.unique(regions[here][off <= NEAREST_M])
     return np.isin(regions, found[found > 0])

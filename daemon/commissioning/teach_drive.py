@@ -60,7 +60,7 @@ class Drive:
     def warnings(self) -> list[str]:
         """What limits the use of the drive, one sentence each."""
         return [
-            *([f"{self.stopped}; the drive up to there is used"] if self.stopped else []),
+            *([f"{self.stopped}; the drive is used up to there"] if self.stopped else []),
             *filter(None, [self.doubt]),
         ]
 
@@ -107,7 +107,7 @@ def read_drive(source: Source, settings: Config, given: Given) -> Drive:
 
 def _check(source: Source, drive: Drive) -> None:
     if len(drive.poses.stamps) < 2:
-        remedy = "record the drive with the lidar on: where the robot was is taken from the laser"
+        remedy = "record the drive with the lidar on; the lidar gives the poses"
         raise DataInvalid(str(source.path), f"{source.kind} without scans that gave a pose", remedy)
 
 
@@ -119,10 +119,8 @@ def heard(drive: Drive) -> Heard:
     """
     parts = [part for stamp, epoch in drive.epochs for part in _strengths(stamp, epoch)]
     if not parts:
-        remedy = (
-            "a teach drive needs the photodiode configured (photodiode.bus) and lamps in view; see docs/calibration.md"
-        )
-        raise DataInvalid(str(drive.path), "no light of any lamp was decoded in it", remedy)
+        remedy = "configure the photodiode (photodiode.bus) and drive with lamps in view; see docs/calibration.md"
+        raise DataInvalid(str(drive.path), "no lamp was decoded in the recording", remedy)
     t, code, amplitude, sigma, name = np.array(parts).T
     pose, known = poses_at(drive.poses, t)
     rows = Rows(pose[known], code[known].astype(np.int64), amplitude[known], sigma[known], t[known])

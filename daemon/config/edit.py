@@ -51,7 +51,7 @@ def _first_right(candidates: Iterator[str], wanted: dict[str, Any], path: str) -
                 return candidate
         except tomllib.TOMLDecodeError:
             continue
-    raise CannotEdit(f"`{path}` cannot be set in this file without rewriting it: set it with an editor")
+    raise CannotEdit(f"`{path}` cannot be set automatically in this file; set it with an editor")
 
 
 def _put(tree: dict[str, Any], keys: list[str], value: object) -> None:

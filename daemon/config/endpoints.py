@@ -101,12 +101,12 @@ def parse_lidar(text: str) -> LidarPlace:
     if text.startswith(f"{AUTO}:"):
         serial = text.removeprefix(f"{AUTO}:")
         if not re.fullmatch(r"[A-Za-z0-9_-]+", serial):
-            raise ValueError(f"Expected a serial number behind `auto:`, as in auto:H0906091, got `{text}`")
+            raise ValueError(f"Expected a serial number after `auto:`, as in auto:H0906091, got `{text}`")
         return LidarPlace(AUTO, serial)
     if (rate := re.fullmatch(r"(/.*)@(\d+)", text) or re.fullmatch(r"(/dev/tty\w+)@(.*)", text)) is None:
         return LidarPlace(text)
     if not rate[2].isdecimal() or int(rate[2]) not in SCIP_BAUDS:
-        raise ValueError(f"Expected a line rate of {', '.join(map(str, SCIP_BAUDS))} behind `@`, got `{text}`")
+        raise ValueError(f"Expected a line rate of {', '.join(map(str, SCIP_BAUDS))} after `@`, got `{text}`")
     return LidarPlace(rate[1], baud=int(rate[2]))
 
 
@@ -118,15 +118,15 @@ def parse_line(text: str) -> RtuLine:
     """
     form = r"(?P<path>/[^@#]+)(?:@(?P<baud>\d+)(?:,(?P<format>\w+))?)?(?:#(?P<unit>\d+))?"
     if (match := re.fullmatch(form, text)) is None:
-        raise ValueError(f"Expected a path with its line rate and our unit, as in /dev/ttyUSB1@115200#1, got `{text}`")
+        raise ValueError(f"Expected a path with line rate and unit, as in /dev/ttyUSB1@115200#1, got `{text}`")
     baud, style, unit = DEFAULT_RTU
     line = RtuLine(match["path"], int(match["baud"] or baud), match["format"] or style, int(match["unit"] or unit))
     if line.baud not in RTU_BAUDS:
-        raise ValueError(f"Expected a line rate of {', '.join(map(str, RTU_BAUDS))} behind `@`, got `{text}`")
+        raise ValueError(f"Expected a line rate of {', '.join(map(str, RTU_BAUDS))} after `@`, got `{text}`")
     if line.format not in RTU_FORMATS:
-        raise ValueError(f"Expected a format of {', '.join(RTU_FORMATS)} behind the rate, got `{text}`")
+        raise ValueError(f"Expected a format of {', '.join(RTU_FORMATS)} after the rate, got `{text}`")
     if not 1 <= line.unit <= 247:
-        raise ValueError(f"Expected a unit from 1 to 247 behind `#`, got `{text}`")
+        raise ValueError(f"Expected a unit from 1 to 247 after `#`, got `{text}`")
     return line
 
 

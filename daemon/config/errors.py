@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 MOVED: Final = {
     "lidar.serial": 'write lidar.device = "auto:SERIAL", as in "auto:H0906091"',
-    "lidar.baud": 'write the rate behind the path, as in lidar.device = "/dev/ttyUSB0@115200", or leave it out: it is '
-    "found by itself",
+    "lidar.baud": 'write the rate after the path, as in lidar.device = "/dev/ttyUSB0@115200", or omit it for '
+    "automatic detection",
 }
 """Keys of earlier versions, and their present replacement."""
 LONGEST: Final = 60
@@ -137,7 +137,7 @@ def _nul(tree: dict[str, Any], parents: tuple[str, ...]) -> Iterator[_Problem]:
             yield from _nul(value, (*parents, key))
         elif "\0" in str(value):
             keys = (*parents, key)
-            yield _Problem(keys, f"`{'.'.join(keys)}` holds the character \\u0000; leave it out")
+            yield _Problem(keys, f"`{'.'.join(keys)}` contains the character \\u0000; remove it")
 
 
 def _explain(message: str, tree: dict[str, Any]) -> _Problem:
@@ -223,7 +223,7 @@ def _nearest(path: str, table: bool) -> str:
     values = [option.path for option in options()]
     tables = sorted({path[: dot.start()] for path in values for dot in re.finditer(r"\.", path)})
     if path in values or path in tables:
-        return f": quotes make one name of it; did you mean `{path}`?"
+        return f": the quotes make this one name; did you mean `{path}`?"
     known = tables if table else values
     last = path.rpartition(".")[2]
     same_name = [other for other in known if other.rpartition(".")[2] == last]

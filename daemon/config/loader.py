@@ -154,7 +154,7 @@ def naming(file: Path | None, key: str, path: Path) -> str:
         for part in key.split("."):
             told = told[part]
         if file is not None and (file.resolve().parent / told) == path and (line := line_of(text, key)):
-            return f"{file}:{line} names it: `{key}`"
+            return f"{file}:{line} names it with `{key}`"
     except (OSError, ValueError, KeyError, TypeError):
         pass  # errors of the configuration itself are reported elsewhere
     return f"`{key}` names it"
@@ -249,7 +249,7 @@ def template() -> str:
 def refuse_overwriting(path: Path, force: bool) -> None:
     """Raise `ConfigError` where the file exists and ``force`` is not set."""
     if path.exists() and not force:
-        raise ConfigError(f"{path} exists: name another file with --out, or ask for it to be replaced with --force")
+        raise ConfigError(f"{path} exists already; name another file with --out, or replace it with --force")
 
 
 def schema() -> str:

@@ -82,12 +82,14 @@ def unpack(content: bytes, survey: Survey, path: str) -> ResidualMap:
     except _DAMAGE as error:
         raise ResidualError(f"{path}: not a residual map ({error}); {_AGAIN}") from error
     if kept["version"].tolist() != [VERSION]:
-        raise ResidualError(f"{path}: of version {kept['version'].tolist()}, this is {VERSION}; {_AGAIN}")
+        raise ResidualError(
+            f"{path}: the file has version {kept['version'].tolist()}, this program reads version {VERSION}; {_AGAIN}"
+        )
     arrays = {name: kept[name] for name in _ARRAYS}
     if str(kept["check"]) != _check(arrays):
-        raise ResidualError(f"{path}: damaged (its checksum does not fit); {_AGAIN}")
+        raise ResidualError(f"{path}: the file is damaged (checksum); {_AGAIN}")
     if str(kept["survey"]) != digest(survey):
-        raise ResidualError(f"{path}: was learned with another survey than the one beside it; {_AGAIN}")
+        raise ResidualError(f"{path}: the residual map belongs to another survey than the one beside it; {_AGAIN}")
     grid, mean, sigma = (np.ascontiguousarray(arrays[name], dtype=np.float64) for name in ("grid", "mean", "sigma"))
     return ResidualMap(tuple(arrays["lamp_ids"].tolist()), grid, mean, sigma, float(arrays["noise"][0]))
 

@@ -57,8 +57,8 @@ class Mount(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     x: Annotated[Metres, Meta(description="metres ahead of the robot's centre")] = 0.0
     y: Annotated[Metres, Meta(description="metres to the left of the robot's centre")] = 0.0
-    yaw: Annotated[Degrees, Meta(description="degrees the lidar's front axis is turned counter-clockwise")] = 0.0
-    inverted: Annotated[bool, Meta(description="true when the lidar hangs upside down")] = False
+    yaw: Annotated[Degrees, Meta(description="degrees, counter-clockwise rotation of the lidar's front axis")] = 0.0
+    inverted: Annotated[bool, Meta(description="true if the lidar is mounted upside down")] = False
 
 
 class Mask(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -71,7 +71,7 @@ class Mask(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
             examples=[((-135.0, -120.0), (120.0, 135.0))],
         ),
     ] = ()
-    near: Annotated[float, Meta(ge=0.0, le=10.0, description="metres; everything nearer is ignored")] = 0.05
+    near: Annotated[float, Meta(ge=0.0, le=10.0, description="metres; nearer ranges are ignored")] = 0.05
 
     def __post_init__(self) -> None:
         for begin, end in self.sectors:
@@ -86,11 +86,12 @@ class LidarConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         str,
         Meta(
             min_length=1,
-            description="auto (look for one), auto:SERIAL (that one), a path such as /dev/ttyACM0 or "
-            "/dev/ttyUSB0@115200 (fixed line rate), tcp://host:port (10940 without a port), or none (lights alone)",
+            description="auto (search), auto:SERIAL (that sensor), a path such as /dev/ttyACM0 or "
+            "/dev/ttyUSB0@115200 (fixed line rate), tcp://host:port (default port 10940), or none (light "
+            "only)",
         ),
     ] = "auto"
-    intensity: Annotated[bool, Meta(description="true to read intensities too, where the model can")] = False
+    intensity: Annotated[bool, Meta(description="true to read intensities too, if the model supports it")] = False
     mount: Mount = Mount()
     mask: Mask = Mask()
 
@@ -125,7 +126,7 @@ def parse_chip(text: str) -> tuple[str, int, int | None]:
     """
     match = re.fullmatch(r"(?P<chip>\w+)@(?P<address>0[xX][0-9A-Fa-f]{1,2}|\d{1,3})(?:/(?P<channel>\d))?", text)
     if match is None:
-        raise ValueError(f"Expected chip@address, as in mcp3221@0x4d, got `{text}`")
+        raise ValueError(f"Expected type@address, as in mcp3221@0x4d, got `{text}`")
     channel = None if match["channel"] is None else int(match["channel"])
     return match["chip"], int(match["address"], 0), channel
 
@@ -141,13 +142,14 @@ class PhotodiodeConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
             examples=["/dev/i2c-1"],
         ),
     ] = ""
-    converter: Annotated[str, Meta(description="its converter, chip@address: mcp3221, adc121c021 or adc121c027")] = (
+    converter: Annotated[str, Meta(description="its converter, type@address: mcp3221, adc121c021 or adc121c027")] = (
         "mcp3221@0x4d"
     )
     level: Annotated[
         str,
         Meta(
-            description="DC channel that tells dark from dazzled, chip@address/channel: ads1115@0x48/0; empty: none",
+            description="DC channel that distinguishes darkness from saturation, type@address/channel: ads1115@0x48/0; "
+            "empty: none",
             examples=["ads1115@0x48/0"],
         ),
     ] = ""
@@ -183,7 +185,9 @@ class PhotodiodeConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         try:
             chip, address, channel = parse_chip(self.level)
             if channel is None or address == converter:
-                raise ValueError(f"Expected chip@address/channel beside the converter, got `{self.level}`")
+                raise ValueError(
+                    f"Expected type@address/channel with another address than the converter, got `{self.level}`"
+                )
             LevelInput(chip, address, channel)
         except ValueError as error:
             raise ValueError(f"{error} in `level`") from None
@@ -216,13 +220,11 @@ class MapConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     folder: Annotated[
         str,
         Meta(
-            description="folder for maps, relative to this file; empty: the state directory; none: maps are not kept",
+            description="folder for maps, relative to this file; empty: the state directory, none: maps are not stored",
             examples=["maps"],
         ),
     ] = ""
-    localise: Annotated[
-        bool, Meta(description="true to use the stored map as it is: it is never changed and never written")
-    ] = False
+    localise: Annotated[bool, Meta(description="true to use the stored map unchanged and never write it")] = False
 
     def __post_init__(self) -> None:
         if self.localise and not self.kept:
@@ -237,16 +239,14 @@ class MapConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 class OdometryConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """Optional input of wheel odometry and gyro readings."""
 
-    port: Annotated[
-        Port, Meta(description="UDP port that takes odometry and IMU datagrams; 0: none", examples=[9001])
-    ] = 0
+    port: Annotated[Port, Meta(description="UDP port for odometry and IMU datagrams; 0: none", examples=[9001])] = 0
 
 
 class CycleConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """The cycle: one per scan."""
 
     budget_ms: Annotated[
-        float, Meta(ge=0.0, le=1000.0, description="milliseconds one cycle may take; 0: half of the scan period")
+        float, Meta(ge=0.0, le=1000.0, description="time budget of a cycle in milliseconds; 0: half of the scan period")
     ] = 0.0
 
 
@@ -257,8 +257,8 @@ class ModbusConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     serial: Annotated[
         str,
         Meta(
-            description="serial line for RTU, /dev/ttyUSB1@115200#1: path, line rate (19200; a format may follow, "
-            "@9600,8N1; else 8E1), our unit (1); empty: none",
+            description="serial line for RTU, such as /dev/ttyUSB1@115200,8N1#1: path, line rate (default "
+            "19200), format (default 8E1), unit (default 1); empty: none",
             examples=["/dev/ttyUSB1@115200#1"],
         ),
     ] = ""
@@ -279,7 +279,11 @@ class IntegrityConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     alert_m: Annotated[
         float,
-        Meta(ge=0.0, le=60.0, description="metres; an alert is raised while the position error may be larger; 0: none"),
+        Meta(
+            ge=0.0,
+            le=60.0,
+            description="alert limit in metres for the protection level; 0: none",
+        ),
     ] = 0.0
 
 
@@ -289,8 +293,8 @@ class PoseConfig(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     receivers: Annotated[
         tuple[str, ...],
         Meta(
-            description="where to send them, each `host:port`, a multicast group too; `*:port`: to whoever subscribes "
-            "by a datagram to that port",
+            description="receivers, each `host:port`, also a multicast group; `*:port`: all clients that "
+            "subscribe at that port",
             examples=[("192.168.0.20:9000", "*:9000")],
         ),
     ] = ()
@@ -315,12 +319,12 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     ] = "lumiloop"
     bind: Annotated[
         str,
-        Meta(description="address of this machine the servers listen on; 0.0.0.0: reachable from every network"),
+        Meta(description="address of this computer for the servers; 0.0.0.0: reachable from every network"),
     ] = "127.0.0.1"
     allow: Annotated[
         tuple[str, ...],
         Meta(
-            description="addresses and networks (192.168.0.0/24) that the servers answer; empty: all that reach `bind`",
+            description="addresses and networks (192.168.0.0/24) with access; empty: all that reach `bind`",
             examples=[("192.168.0.0/24", "10.0.0.7")],
         ),
     ] = ()
@@ -342,7 +346,9 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         if not self.lidar.fitted and not self.photodiode.fitted:
             raise ValueError("Expected a lidar, because `photodiode.bus` is empty, in `lidar.device`, got `none`")
         if self.modbus.serial and self.lidar.place.device == parse_line(self.modbus.serial).path:
-            raise ValueError(f"Expected another line than the lidar's in `modbus.serial`, got `{self.modbus.serial}`")
+            raise ValueError(
+                f"Expected a line that the lidar does not use in `modbus.serial`, got `{self.modbus.serial}`"
+            )
         self._check_ports()
 
     def _check_ports(self) -> None:

@@ -127,7 +127,7 @@ def _numbers(lamps: list[_Judged], lines: _Lines) -> list[tuple[int, str]]:
     found, seen = [], dict[int, int]()
     for at, lamp in enumerate(lamps):
         if lamp.has("lamp_id") and (number := lamp.good["lamp_id"]) in seen:
-            words = f"lamp {number}: that `lamp_id` is taken already{_by_line(lines.of('', seen[number]))}"
+            words = f"lamp {number}: another lamp has this `lamp_id`{_by_line(lines.of('', seen[number]))}"
             found.append((lines.of("", at), words))
         elif lamp.has("lamp_id"):
             seen[number] = at
@@ -139,13 +139,13 @@ def _places(lamps: list[_Judged], eye: _Judged, lines: _Lines) -> list[tuple[int
     found, hung = [], list[tuple[int, _Judged]]()
     for at, lamp in enumerate(lamps):
         if lamp.has("z") and eye.has("z") and lamp.good["z"] < eye.good["z"] + HEADROOM_M:
-            words = f"hangs at z = {lamp.good['z']} m, not above the receiver (z = {eye.good['z']} m)"
+            words = f"is at z = {lamp.good['z']} m, not above the receiver (z = {eye.good['z']} m)"
             found.append((lines.of("", at), f"{_named(lamp, at)}: {words}"))
         if not lamp.has("x", "y", "z"):
             continue
         other = next((other for other in hung if math.dist(_place(lamp), _place(other[1])) < NEAREST_M), None)
         if other is not None:
-            words = f"hangs where {_named(other[1], other[0])} hangs{_by_line(lines.of('', other[0]))}"
+            words = f"has the position of {_named(other[1], other[0])}{_by_line(lines.of('', other[0]))}"
             found.append((lines.of("", at), f"{_named(lamp, at)}: {words}; correct or delete one of them"))
         hung.append((at, lamp))
     return found
@@ -156,7 +156,7 @@ def _place(lamp: _Judged) -> tuple[float, float, float]:
 
 
 def _by_line(line: int) -> str:
-    return f" by line {line}" if line else ""
+    return f" in line {line}" if line else ""
 
 
 def _codes(lamps: list[_Judged], lines: _Lines, profile: Profile) -> list[tuple[int, str]]:
@@ -164,8 +164,8 @@ def _codes(lamps: list[_Judged], lines: _Lines, profile: Profile) -> list[tuple[
     return [
         (
             lines.of("code", at),
-            f"{_named(lamp, at)}: code {lamp.good['code']} is none of profile {profile.name}, which has codes 0 to "
-            f"{last_code(profile)}; correct it, or `photodiode.profile`",
+            f"{_named(lamp, at)}: code {lamp.good['code']} is not in profile {profile.name}, which has codes "
+            f"0 to {last_code(profile)}; correct it, or `photodiode.profile`",
         )
         for at, lamp in enumerate(lamps)
         if lamp.has("code") and lamp.good["code"] > last_code(profile)

@@ -76,7 +76,7 @@ def write_survey(
         SurveyError: the file exists already, or it cannot be written.
     """
     if path.exists() and not force:
-        raise SurveyError(f"{path} exists: name another file, or ask for it to be replaced with --force")
+        raise SurveyError(f"{path} exists already; name another file, or replace it with --force")
     try:
         write_whole(path, dump(survey, notes, remarks or {}).encode())
     except OSError as error:
@@ -130,7 +130,7 @@ def _read(path: Path) -> str:
     try:
         return read_named(path, MOST_BYTES).decode()
     except FileNotFoundError:
-        raise SurveyError(f"{path}: no such survey (`lumiloop survey` makes one from a drive)") from None
+        raise SurveyError(f"{path}: no such survey; `lumiloop survey` makes one from a drive") from None
     except UnicodeDecodeError as error:
         raise SurveyError(f"{path}: not UTF-8 text at byte {error.start}") from None
     except OSError as error:

@@ -40,7 +40,7 @@ class LampEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     code: Annotated[int, Meta(ge=0, le=_LAST_CODE, description="number of the CDMA code it sends", examples=[73])]
     x: Annotated[Metres, Meta(description="metres, luminous centre", examples=[2.5])]
     y: Annotated[Metres, Meta(description="metres, luminous centre", examples=[7.5])]
-    z: Annotated[float, Meta(ge=0.5, le=100.0, description="metres above the floor", examples=[2.6])]
+    z: Annotated[float, Meta(ge=0.5, le=100.0, description="metres above the ground", examples=[2.6])]
     power_w: Annotated[float, Meta(ge=1e-4, le=1e4, description="mean radiant power, W")] = _LAMP.power_w
     order: (
         Annotated[float, Meta(ge=0.05, le=60.0, description="Lambert order; or give half_angle_deg", examples=[1.0])]
@@ -49,12 +49,12 @@ class LampEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     half_angle_deg: (
         Annotated[
             float,
-            Meta(ge=5.0, le=89.0, description="angle at which intensity has halved; or give order", examples=[60.0]),
+            Meta(ge=5.0, le=89.0, description="angle of half intensity; or give order", examples=[60.0]),
         ]
         | None
     ) = None
-    slope_x: Annotated[Slope, Meta(description="lean of the lamp's axis towards x, metres per metre down")] = 0.0
-    slope_y: Annotated[Slope, Meta(description="lean of the lamp's axis towards y, metres per metre down")] = 0.0
+    slope_x: Annotated[Slope, Meta(description="tilt of the lamp's axis towards x, metres per metre down")] = 0.0
+    slope_y: Annotated[Slope, Meta(description="tilt of the lamp's axis towards y, metres per metre down")] = 0.0
     sigma: Annotated[float, Meta(ge=1e-3, le=2.0, description="one sigma of ln(power); 0.05 is 5 %")] = _LAMP.sigma_ln
 
     def __post_init__(self) -> None:
@@ -75,15 +75,15 @@ class ReceiverEntry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     x: Annotated[float, Meta(ge=-5.0, le=5.0, description="metres ahead of the robot's centre")] = _RECEIVER.x
     y: Annotated[float, Meta(ge=-5.0, le=5.0, description="metres to the left of the robot's centre")] = _RECEIVER.y
-    z: Annotated[float, Meta(ge=0.0, le=20.0, description="metres above the floor")] = _RECEIVER.z
+    z: Annotated[float, Meta(ge=0.0, le=20.0, description="metres above the ground")] = _RECEIVER.z
     area_cm2: Annotated[float, Meta(ge=1e-4, le=100.0, description="its active area, cm^2")] = 1e4 * _RECEIVER.area_m2
     responsivity: Annotated[float, Meta(ge=1e-3, le=2.0, description="A per W")] = _RECEIVER.responsivity
     order: Annotated[float, Meta(ge=0.05, le=10.0, description="exponent of its cosine; 1 for a bare diode")] = (
         _RECEIVER.order
     )
-    half_fov_deg: Annotated[float, Meta(ge=5.0, le=90.0, description="it sees nothing farther from its axis")] = 60.0
-    slope_x: Annotated[Slope, Meta(description="lean of its axis forward, metres per metre up")] = 0.0
-    slope_y: Annotated[Slope, Meta(description="lean of its axis to the left, metres per metre up")] = 0.0
+    half_fov_deg: Annotated[float, Meta(ge=5.0, le=90.0, description="largest angle from its axis")] = 60.0
+    slope_x: Annotated[Slope, Meta(description="tilt of its axis forward, metres per metre up")] = 0.0
+    slope_y: Annotated[Slope, Meta(description="tilt of its axis to the left, metres per metre up")] = 0.0
 
     def receiver(self) -> Receiver:
         """The receiver as an estimator type."""
@@ -98,13 +98,13 @@ class SurveyTree(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     lamp: Annotated[
         tuple[LampEntry, ...],
         Meta(
-            description="the lamps; [] with a [receiver]: the lamps describe themselves",
+            description="the lamps; [] with a [receiver]: the lamps send their own positions",
             examples=[[{"lamp_id": 10, "code": 73, "x": 2.5, "y": 7.5, "z": 2.6}]],
         ),
     ]
-    floor: Annotated[float, Meta(ge=0.0, le=0.5, description="diffuse light, part of a lamp's own at its nadir")] = (
-        _SURVEY.floor
-    )
+    floor: Annotated[
+        float, Meta(ge=0.0, le=0.5, description="diffuse light as a share of a lamp's RSS at its nadir")
+    ] = _SURVEY.floor
     depth: (
         Annotated[
             float,
@@ -118,7 +118,7 @@ class SurveyTree(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     def __post_init__(self) -> None:
         if not self.lamp and self.receiver is None:
-            raise ValueError("Expected lamps, or a [receiver] for lamps that describe themselves, got neither")
+            raise ValueError("Expected lamps, or a [receiver] for lamps that send their own positions, got neither")
 
     @property
     def eye(self) -> ReceiverEntry:

@@ -80,7 +80,7 @@ def read_residuals(survey: Path) -> bytes:
     except FileNotFoundError:
         return b""
     except OSError as error:
-        raise SurveyError(f"{path}: cannot be read: {error.strerror}; mend that, or move it away") from error
+        raise SurveyError(f"{path}: cannot be read: {error.strerror}; correct it, or move the file away") from error
 
 
 def _residuals_or_none(survey: Path) -> bytes:
@@ -88,7 +88,7 @@ def _residuals_or_none(survey: Path) -> bytes:
     try:
         return read_residuals(survey)
     except SurveyError as error:
-        log.warning("%s; driving without it", error)
+        log.warning("%s; the daemon runs without it", error)
         return b""
 
 
@@ -112,7 +112,7 @@ def from_header(header: dict[str, Any], folder: Path | None = None) -> Lights | 
         residuals = inside or _kept_residuals(folder, kept.get("residuals_sha256", ""))
         return Lights(survey, PROFILES[kept["profile"]], kept["clock_ppm"], residuals)
     except (KeyError, TypeError, ValueError, msgspec.ValidationError) as error:
-        raise ValueError(f"the recording's lights are not of this version ({error})") from error
+        raise ValueError(f"the light configuration of the recording is of another version ({error})") from error
 
 
 def lost_residuals(header: dict[str, Any], lights: Lights) -> bool:

@@ -92,7 +92,7 @@ class SampleClock:
 
     def _refuse(self, error: Exception) -> None:
         if not self._refused:
-            line = "the sample clock cannot be kept in %s: %s; it is tried again"
+            line = "cannot store the rate of the sample clock in %s: %s; the daemon tries again"
             log.warning(line, self._path, reason_of(error), exc_info=defect_in(error))
         self._refused, self._retry_at = True, time.monotonic() + RETRY_S
 
@@ -103,9 +103,9 @@ class SampleClock:
         except FileNotFoundError:
             return {}
         except OSError as error:
-            log.warning("%s cannot be read: %s; the sample clock is found anew", self._path, error.strerror)
+            log.warning("%s cannot be read: %s; the daemon measures the sample clock again", self._path, error.strerror)
         except (ValueError, AttributeError, TypeError, OverflowError, RecursionError):
-            log.warning("%s is damaged and passed over; the sample clock is found anew", self._path)
+            log.warning("%s is damaged and ignored; the daemon measures the sample clock again", self._path)
         return {}
 
     def _possible(self, ppm: float) -> bool:

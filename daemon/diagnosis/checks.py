@@ -90,25 +90,27 @@ def configuration(case: Case) -> Iterator[Finding]:
     """Checks the configuration; an unreadable file ends the doctor before this check."""
     about = "configuration"
     if case.file is None:
-        yield remark(about, "none named: built-in values are looked at", "name the daemon's: --config FILE")
+        yield remark(
+            about, "none was found; the doctor checks the built-in values", "name the daemon's file with --config FILE"
+        )
     else:
         yield good(about, str(case.file))
     for said in implausible(case.settings.lidar.mount):
-        yield remark(about, said, "correct it, or leave it if it is so")
+        yield remark(about, said, "correct the value if it is wrong")
 
 
 def clock(case: Case) -> Iterator[Finding]:
     """Checks the calendar: poses carry UTC, but the estimate itself does not need it."""
     if case.host.utc() < FIRST_UTC:
-        yield fix(
-            "clock", "the calendar says a year before 2025", "set it, or start a time service: timedatectl set-ntp true"
-        )
+        yield fix("clock", "is set to a year before 2025", "set it, or start a time service: timedatectl set-ntp true")
     elif case.host.synchronised() is False:
         yield remark(
-            "clock", "follows no time server: stamps in UTC drift, poses do not", "timedatectl set-ntp true, or chrony"
+            "clock",
+            "is not synchronised to a time server; UTC stamps drift, poses do not",
+            "run `timedatectl set-ntp true`, or install chrony",
         )
     else:
-        yield good("clock", "is set" + (" and follows a time server" if case.host.synchronised() else ""))
+        yield good("clock", "is set" + (" and synchronised to a time server" if case.host.synchronised() else ""))
 
 
 def cache(case: Case) -> Iterator[Finding]:
@@ -116,17 +118,17 @@ def cache(case: Case) -> Iterator[Finding]:
     try:
         warmth = case.host.warm(case.settings.photodiode)
     except CannotLoad as error:
-        yield fix("kernels", str(error), "give the daemon a folder of its own to write into")
+        yield fix("kernels", str(error), "give the daemon a folder with write access")
         return
     if warmth is None:
-        text = "of this version are not compiled for this user: the first start takes a minute or two"
-        yield remark("kernels", text, "run once: lumiloop warm")
+        text = "of this version are not compiled for this user; the first start takes a minute or two"
+        yield remark("kernels", text, "run `lumiloop warm` once")
     elif warmth.unwritten:
-        text = f"were missing or damaged, and cannot be stored: {warmth.unwritten}; each start compiles them"
-        yield fix("kernels", text, "make room on that disk, or name another folder with NUMBA_CACHE_DIR")
+        text = f"were missing or damaged and cannot be stored ({warmth.unwritten}); each start compiles them"
+        yield fix("kernels", text, "free disk space, or name another folder with NUMBA_CACHE_DIR")
     elif warmth.damaged:
-        text = f"{warmth.damaged} of their files were damaged; their kernels have been compiled again"
-        yield remark("kernels", text, "after a power cut that is all; if it comes again, the disk is failing")
+        text = f"{warmth.damaged} files were damaged; their kernels are compiled again"
+        yield remark("kernels", text, "no action is needed after a power cut; if it happens again, check the disk")
     else:
         yield good("kernels", f"are compiled, and load in {warmth.seconds:.1f} s")
 
@@ -136,10 +138,10 @@ def disk(case: Case) -> Iterator[Finding]:
     for folder in filter(can_be_made, {_maps(case.settings) or state_folder(), state_folder()}):
         free = case.host.free_bytes(folder)
         if free < FREE_BYTES:
-            text = f"{free >> 20} MB are free where {folder} is: maps cannot be saved when it is full"
-            yield fix("disk", text, f"free some space there, or set map.folder; {FREE_BYTES >> 20} MB are enough")
+            text = f"{free >> 20} MB are free at {folder}; maps cannot be saved on a full disk"
+            yield fix("disk", text, f"free disk space there, or set `map.folder`; {FREE_BYTES >> 20} MB are enough")
             return
-    yield good("disk", "there is room")
+    yield good("disk", "has enough free space")
 
 
 def lidar(case: Case) -> Iterator[Finding]:
@@ -152,9 +154,9 @@ def lidar(case: Case) -> Iterator[Finding]:
     device = case.settings.lidar.place.device
     named = [device] if device != AUTO else case.host.lidars()
     if not named:
-        text = "no serial device that may be a HOKUYO is plugged in"
+        text = "no serial device that could be a HOKUYO is connected"
         yield fix(
-            "lidar", text, 'plug it in and give it power; an Ethernet model: lidar.device = "tcp://ADDRESS:10940"'
+            "lidar", text, 'connect it and switch it on; for an Ethernet model set lidar.device = "tcp://ADDRESS:10940"'
         )
     for name in named:
         finding = _unusable("lidar", name, case.host) or _lidar_at(name, case)
@@ -169,8 +171,8 @@ def _lidar_at(name: str, case: Case) -> Finding:
         return fix("lidar", f"{found.device}: {found.error.problem}", found.error.remedy)
     wanted = case.settings.lidar.place.serial
     if wanted and found.geometry is not None and found.geometry.serial != wanted:
-        text = f"{name}: serial {found.geometry.serial}, configured is {wanted}"
-        return fix("lidar", text, f'plug in that one, or set lidar.device = "auto:{found.geometry.serial}"')
+        text = f"{name}: serial {found.geometry.serial}, but {wanted} is configured"
+        return fix("lidar", text, f'connect that sensor, or set lidar.device = "auto:{found.geometry.serial}"')
     return good("lidar", str(found))
 
 
@@ -192,12 +194,10 @@ def photodiode(case: Case) -> Iterator[Finding]:
         yield fix("photodiode", f"{found.bus}: {found.error.problem}", found.error.remedy)
     elif here is None:
         others = ", ".join(map(str, found.chips)) or "nothing"
-        remedy = "check power, SDA and SCL, or set photodiode.converter to what is there"
-        yield fix("photodiode", f"{settings.bus}: no {name} at {address}; there is {others}", remedy)
+        remedy = "check power, SDA and SCL, or correct `photodiode.converter`"
+        yield fix("photodiode", f"{settings.bus}: no {name} at {address}; found: {others}", remedy)
     elif not here.usable or name.lower() not in here.name.lower():
-        yield fix(
-            "photodiode", f"{settings.bus}: {here}, configured is {name}", "set photodiode.converter to what is there"
-        )
+        yield fix("photodiode", f"{settings.bus}: {here}, but {name} is configured", "correct `photodiode.converter`")
     else:
         yield good("photodiode", f"{settings.bus}: {here}")
 
@@ -207,12 +207,14 @@ def _unusable(about: str, device: str, host: Host) -> Finding | None:
     if not device.startswith("/"):
         return None
     if not host.exists(device):
-        what = "the bus may have to be enabled first" if is_bus(device) else "plug it in, or name another"
-        return fix(about, f"{device}: not there", f"{what}; `lumiloop probe` finds what there is")
+        what = (
+            ("enable the bus in the operating system first") if is_bus(device) else "connect it, or name another device"
+        )
+        return fix(about, f"{device}: no such device", f"{what}; `lumiloop probe` lists the devices that are connected")
     if not host.usable(device):
         group = GROUPS["i2c" if is_bus(device) else "tty"]
         remedy = f"sudo usermod -aG {group} {host.user()}, then log in again"
-        return fix(about, f"{device}: may not be opened by {host.user()}", remedy)
+        return fix(about, f"{device}: access denied for {host.user()}", remedy)
     return None
 
 
@@ -236,10 +238,10 @@ def ports(case: Case) -> Iterator[Finding]:
             name = "TCP" if kind is socket.SOCK_STREAM else "UDP"
             refused = refusal(name, key, port, why)
             others = why.errno == errno.EADDRINUSE
-            remedy = f"`ss -lnp` says who has {port}; or set another {key}" if others else refused.remedy
+            remedy = f"`ss -lnp` shows which program uses {port}; or set another {key}" if others else refused.remedy
             yield fix("ports", f"{key}: {name} {settings.bind}:{port}: {refused.problem}", remedy)
     if not bad:
-        yield good("ports", ", ".join(sorted({f"{key} {port}" for key, _, port in wanted})) + " can be had")
+        yield good("ports", ", ".join(sorted({f"{key} {port}" for key, _, port in wanted})) + " is free")
 
 
 def rtu(case: Case) -> Iterator[Finding]:
@@ -254,7 +256,7 @@ def receivers(case: Case) -> Iterator[Finding]:
     for receiver in case.settings.pose.receivers:
         host, _ = parse_endpoint(receiver)
         if host != ANYBODY and (why := case.host.resolved(host)):
-            remedy = "correct the name in pose.receivers, or write the address; is the network up?"
+            remedy = "correct the name in `pose.receivers`, or write the address; check the network"
             yield fix("receivers", f"{receiver}: {why}", remedy)
 
 
@@ -262,15 +264,15 @@ def maps(case: Case) -> Iterator[Finding]:
     """Checks the map folder and the initial map."""
     settings = case.settings
     if not settings.map.kept:
-        yield remark("maps", "are not kept: `map.folder` is none")
+        yield remark("maps", "are not stored, because `map.folder` is none")
         return
     found, text = look_at_maps(settings)
     if found is Maps.TAKEN and not case.runs:
-        yield fix("maps", text, "end it, or name another folder in map.folder")
+        yield fix("maps", text, "end that process, or name another folder in `map.folder`")
     elif found in (Maps.BROKEN, Maps.FROZEN):
-        yield fix("maps", text, "make the folder yours, or name another in map.folder")
+        yield fix("maps", text, "give this user write access, or name another folder in `map.folder`")
     elif settings.map.localise and found is not Maps.READY:
-        yield fix("maps", f"{text}; map.localise asks for one", "map first, or set map.localise = false")
+        yield fix("maps", f"{text}; `map.localise` requires a map", "make a map first, or set map.localise = false")
     else:
         yield good("maps", text)
 
@@ -286,9 +288,7 @@ def survey(case: Case) -> Iterator[Finding]:
     settings = case.settings
     if not settings.lights.survey:
         if settings.photodiode.fitted:
-            yield remark(
-                "survey", "none: lamps that do not send their own place are of no use", "see `lumiloop survey`"
-            )
+            yield remark("survey", "none; only lamps that send their own position can be used", "see `lumiloop survey`")
         return
     path = Path(settings.lights.survey)
     try:
@@ -296,8 +296,8 @@ def survey(case: Case) -> Iterator[Finding]:
     except SurveyError as error:
         named = naming(case.file, "lights.survey", path)
         there = os.path.exists(path)  # noqa: PTH110  Path.exists raises where no file can have that name
-        remedy = "mend it" if there else "put it there, or name another"
-        yield fix("survey", f"{error} ({named})", f"{remedy}; `lumiloop check` reads it again")
+        remedy = "mend it" if there else "create the file, or name another"
+        yield fix("survey", f"{error} ({named})", f"{remedy}; then run `lumiloop check`")
         return
     unused = "" if settings.photodiode.fitted else ", not used: photodiode.bus is empty"
     yield good("survey", f"{settings.lights.survey}: {len(found.lamps)} lamps{unused}")
@@ -307,9 +307,7 @@ def daemon(case: Case) -> Iterator[Finding]:
     """Reports state and faults of the running daemon, with their remedies."""
     heard = case.heard
     if isinstance(heard, str):
-        yield remark(
-            "daemon", f"does not run, or not as `name` {case.settings.name} ({heard})", "see what its log says"
-        )
+        yield remark("daemon", f"no daemon runs with the name {case.settings.name} ({heard})", "read its log")
         return
     if isinstance(heard, Mute):
         yield fix("daemon", heard.text, heard.remedy)
@@ -321,7 +319,9 @@ def daemon(case: Case) -> Iterator[Finding]:
         else:
             yield fix("daemon", f"fault {fault.fault}: {fault.meaning}", fault.remedy)
     if heard.pose is None:
-        yield fix("daemon", f"{heard.name} runs, and tells no pose", "it is starting, or it stands; see its log")
+        yield fix(
+            "daemon", f"{heard.name} runs, but publishes no pose", "it is starting or does not respond; read its log"
+        )
     elif heard.pose.state in (State.TRACKING, State.MAPPING):
         yield good("daemon", f"{heard.name} runs: {heard.pose.state_name}")
     elif not present:
@@ -329,11 +329,11 @@ def daemon(case: Case) -> Iterator[Finding]:
 
 
 _ODD: Final = {
-    LinkUse.UNSURVEYED: ("is received, and no lamp of this code is in the survey", "add it: `lumiloop survey`"),
-    LinkUse.MISSING: ("should be received here and is not", "switch it on, or exchange it"),
+    LinkUse.UNSURVEYED: ("is received, but no lamp with this code is in the survey", "add it with `lumiloop survey`"),
+    LinkUse.MISSING: ("is expected here, but not received", "switch it on or replace it"),
     LinkUse.REJECTED: (
-        "does not shine as surveyed",
-        "it was moved or exchanged: survey it anew, or its code is in use twice",
+        "differs from its survey",
+        "survey it again if it was moved or exchanged; otherwise look for a second lamp with its code",
     ),
     LinkUse.TWIN: ("is received from two lamps", "give one of them another code"),
 }
@@ -344,13 +344,17 @@ def lamps(case: Case) -> Iterator[Finding]:
     if not case.settings.photodiode.fitted:
         return
     if not isinstance(case.heard, Heard):
-        yield remark("lamps", "what is seen of them is told by a running daemon alone", "start it and ask again")
+        yield remark("lamps", "only a running daemon can check them", "start the daemon and run the doctor again")
         return
     seen = case.heard.lamps
     used = sum(use == LinkUse.ACCEPTED for use in seen.values())
     received = sum(use != LinkUse.MISSING for use in seen.values())
     if not received:
-        yield fix("lamps", "none is received", "is it dark here, the photodiode covered, or the air interface another?")
+        yield fix(
+            "lamps",
+            "none is received",
+            "check that the lamps are on, that the photodiode is not covered, and that `photodiode.profile` is correct",
+        )
     lasts = standing(case.heard)
     for (code, lamp_id), use in sorted(seen.items(), key=lambda one: (one[0][0], one[0][1] or 0)):
         if use in _ODD:
@@ -359,7 +363,7 @@ def lamps(case: Case) -> Iterator[Finding]:
             if lasts(use):
                 yield fix("lamps", f"{named} {text}", remedy)
             else:
-                yield remark("lamps", f"{named} {text} at this moment", f"ask again; if it stays so: {remedy}")
+                yield remark("lamps", f"{named} {text} at present", f"run the doctor again; if it persists: {remedy}")
     if received:
         yield good("lamps", f"{received} in view, {used} used")
 
@@ -369,17 +373,17 @@ def realtime(case: Case) -> Iterator[Finding]:
     if case.runs:
         return
     if case.host.realtime():
-        yield good("real time", "may be had")
+        yield good("real time", "is available")
     else:
-        text = f"{case.host.user()} may not take a real-time priority: cycles may be late on a busy computer"
-        yield remark("real time", text, "the systemd service may (LimitRTPRIO=50)")
+        text = f"{case.host.user()} has no right to real-time priority; cycles can be late on a busy computer"
+        yield remark("real time", text, "run the daemon as the systemd service (LimitRTPRIO=50)")
 
 
 def sockets(case: Case) -> Iterator[Finding]:
     """Checks the folder of the local stream."""
     folder = runtime_folder()
     if not case.runs and case.host.exists(str(folder)) and not case.host.usable(str(folder)):
-        remedy = "start it as the user whose folder it is, or set RUNTIME_DIRECTORY"
+        remedy = "start the daemon as the owner of the folder, or set RUNTIME_DIRECTORY"
         yield fix("stream", f"{stream_path(case.settings.name)} cannot be made by {case.host.user()}", remedy)
 
 

@@ -29,7 +29,7 @@ def examine(settings: Config, file: Path, gone: frozenset[str], wrong: list[tupl
     if settings.map.kept and "map.folder" not in gone:
         found, remark = look_at_maps(settings)
         if settings.map.localise and found is not Maps.READY:
-            words = f"{remark}; `map.localise` in {file} asks for a map: `run` would be refused"
+            words = f"{remark}; `map.localise` in {file} requires a map, so `run` cannot start"
             wrong.append((console.FAILED, words))
         remarks.append(remark)
     return remarks
@@ -48,20 +48,23 @@ def _look_at_survey(settings: Config, profile: str | None, file: Path, wrong: li
     except SurveyError as error:
         wrong.append((console.USAGE, f"{error} ({loader.naming(file, 'lights.survey', path)})"))
         return []
-    unused = [] if settings.photodiode.fitted else ["the survey is not used: `photodiode.bus` is empty"]
-    return [f"{path}: good, {len(survey.lamps)} lamps", *unused]
+    unused = [] if settings.photodiode.fitted else ["the survey is not used, because `photodiode.bus` is empty"]
+    return [f"{path}: valid, {len(survey.lamps)} lamps", *unused]
 
 
 def implausible(mount: Mount) -> list[str]:
     """Returns remarks on mount values that may be in other units."""
     said = [
-        f"`lidar.mount.{axis}` = {metres:g}: metres from the robot's centre; is that meant?"
+        f"`lidar.mount.{axis}` = {metres:g}: check the unit, metres from the robot's centre"
         for axis, metres in (("x", mount.x), ("y", mount.y))
         if abs(metres) > FAR_M
     ]
     eighths = mount.yaw / (math.pi / 4)
     if mount.yaw and abs(mount.yaw) < 6.3 and abs(eighths - round(eighths)) < 2e-3:
-        said.append(f"`lidar.mount.yaw` = {mount.yaw:g}: degrees; is {math.degrees(mount.yaw):.0f} meant?")
+        said.append(
+            f"`lidar.mount.yaw` = {mount.yaw:g}: check the unit, degrees; as radians it would be "
+            f"{math.degrees(mount.yaw):.0f} degrees"
+        )
     return said
 
 
@@ -80,5 +83,5 @@ def _look_at_bus(name: str) -> str:
     try:
         about = asyncio.run(look())
     except HalError as error:
-        return f"as seen from here, {error}"
-    return f"{name}: there{f', {about}' if about else ''}; `lumiloop probe {name}` says what answers on it"
+        return f"from this computer, {error}"
+    return f"{name}: there{f', {about}' if about else ''}; `lumiloop probe {name}` identifies it"

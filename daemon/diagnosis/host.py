@@ -176,12 +176,12 @@ class Host:
         try:
             _reach(path)
         except PermissionError:
-            text = f"{path}: {self.user()} may not listen there, so it is not known how it is"
-            return Mute(text, f"sudo usermod -aG {LISTENERS} {self.user()}, then log in again; or ask as root")
+            text = f"{path}: {self.user()} has no access, so its state is unknown"
+            return Mute(text, f"sudo usermod -aG {LISTENERS} {self.user()}, then log in again; or run this as root")
         except OSError:
             return None
-        text = f"{path}: a daemon is there and says nothing of use: {why}"
-        return Mute(text, "it stands, or is of another version; see its log")
+        text = f"{path}: a daemon is present, but its data cannot be used: {why}"
+        return Mute(text, "it does not respond or has another version; read its log")
 
 
 def _reach(path: Path) -> None:

@@ -51,16 +51,16 @@ def load(path: Path) -> list[Look]:
         return []
     lines = path.read_text(errors="replace").splitlines()
     if not lines or lines[0] + "\n" != HEAD:
-        raise BadHistory(f"{path} is no history of lamps: its first line is not `{HEAD.strip()}`; name another file")
+        raise BadHistory(f"{path} is not a lamp history: its first line is not `{HEAD.strip()}`; name another file")
     looks = []
     for number, line in enumerate(lines[1:], 2):
         try:
             utc, lamp, gain, sigma = line.split(",")
             look = Look(float(utc), int(lamp), float(gain), float(sigma))
         except ValueError:
-            raise BadHistory(f"{path}, line {number}: `{line[:60]}` is no line of it; take it out") from None
+            raise BadHistory(f"{path}, line {number}: `{line[:60]}` is not a valid line; remove it") from None
         if not all(map(math.isfinite, (look.utc, look.ln_gain))) or not 0.0 < look.sigma < 1e3:
-            raise BadHistory(f"{path}, line {number}: `{line[:60]}` cannot be; take it out")
+            raise BadHistory(f"{path}, line {number}: `{line[:60]}` is out of range; remove it")
         looks.append(look)
     return sorted(looks)
 

@@ -40,14 +40,14 @@ UNHEARD_S: Final = 7 * DAY_S
 class Finding(Enum):
     """Condition of a lamp, the gravest first."""
 
-    DEAD = "is not received where it must be: dead, switched off, or covered"
-    MOVED = "does not shine as surveyed: moved, exchanged, or its code in use twice"
-    CHANGED = "has changed at once: exchanged, cleaned, or knocked"
-    UNHEARD = "has not been received lately, while others have"
-    WORN = "has come down to seven tenths"
+    DEAD = "is not received where it is expected: defective, off, or covered"
+    MOVED = "differs from its survey: moved, exchanged, or its code is in use twice"
+    CHANGED = "has changed suddenly: exchanged, cleaned, or displaced"
+    UNHEARD = "has not been received recently, but others have"
+    WORN = "has decreased to 70 % of its power"
     DIMMING = "is dimming"
-    GOOD = "is as it was"
-    YOUNG = "is not known for long enough"
+    GOOD = "is unchanged"
+    YOUNG = "has too short a history"
 
 
 URGENT: Final = (Finding.DEAD, Finding.MOVED, Finding.WORN)

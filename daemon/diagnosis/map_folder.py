@@ -37,13 +37,15 @@ def look_at_maps(settings: Config) -> tuple[Maps, str]:
     folder = stored_maps(settings.map.folder)
     if not os.access(folder, os.F_OK):
         if not can_be_made(folder):
-            text = f"{folder}: cannot be made by this user, maps cannot be kept; name another in `map.folder`"
+            text = (
+                f"{folder}: this user cannot create the folder, so maps cannot be stored; name another in `map.folder`"
+            )
             return Maps.BROKEN, text
-        return Maps.EMPTY, f"{folder}: not there yet, maps will be kept in it"
+        return Maps.EMPTY, f"{folder}: the folder does not exist yet; the daemon creates it for its maps"
     if not folder.is_dir():
-        return Maps.BROKEN, f"{folder}: is no folder, maps cannot be kept; name another in `map.folder`"
+        return Maps.BROKEN, f"{folder}: this is not a folder, so maps cannot be stored; name another in `map.folder`"
     if not os.access(folder, os.R_OK | os.X_OK):
-        return Maps.BROKEN, f"{folder}: maps in it cannot be read by this user"
+        return Maps.BROKEN, f"{folder}: this user cannot read the maps in it"
     from daemon.config.survey_loader import SurveyError  # imports numpy, which no other remark needs
     from daemon.devices.light_setup import load_lights
     from daemon.maps.store import Store, judge_for, unjudged
@@ -56,15 +58,15 @@ def look_at_maps(settings: Config) -> tuple[Maps, str]:
     start = store.load(judge)
     unwritten = not settings.map.localise and not os.access(folder, os.W_OK | os.X_OK)
     other = "" if settings.map.localise else _keeper(folder)
-    more = "; nothing can be kept in it by this user (fault 403)" if unwritten else ""
-    more += f"; {other} keeps its maps there, and no other can (fault 403)" if other else ""
+    more = "; this user cannot write to it (fault 403)" if unwritten else ""
+    more += f"; {other} stores its maps there, and only one process can (fault 403)" if other else ""
     if start is None:
         broken = store.refused or unwritten
         text = f"{folder}: {'no map in it can be used' if store.refused else 'no map in it yet'}{more}"
         return Maps.BROKEN if broken else Maps.TAKEN if other else Maps.EMPTY, text
     meta, count = start.stored.meta, len(start.stored.tables["submap.key"])
     named = f" ({meta.name})" if meta.name else ""
-    text = f"{folder}: map {meta.map_id:08x}{named} of {count} submaps is good{more}"
+    text = f"{folder}: map {meta.map_id:08x}{named} of {count} submaps is valid{more}"
     return Maps.FROZEN if unwritten else Maps.TAKEN if other else Maps.READY, text
 
 

@@ -53,7 +53,7 @@ def draw(told: Sequence[Moment], utc: float, grid: Grid, kind: str = "png") -> b
     for row in rows:
         row.axvline(0.0, color="k", linewidth=0.8)
         row.set_xlim(seconds[0], max(seconds[-1], seconds[0] + LAST_S))
-    rows[-1].set_xlabel("seconds from the moment")
+    rows[-1].set_xlabel("seconds from the requested time")
     out = io.BytesIO()
     canvas.savefig(out, format=kind)
     return out.getvalue()
@@ -63,7 +63,7 @@ def _place(axes: Any, told: Sequence[Moment], one: Moment, grid: Grid) -> None:
     """Plots the map, the trajectory coloured by state, the robot, the light solution, and the motion by odometry."""
     poses = [(moment.state, moment.snapshot.pose) for moment in told if moment.snapshot.pose is not None]
     if not poses:
-        axes.set_title("there was no pose")
+        axes.set_title("no pose was available")
         return
     rows, columns = grid.log_odds.shape
     if rows and columns:
@@ -81,7 +81,7 @@ def _place(axes: Any, told: Sequence[Moment], one: Moment, grid: Grid) -> None:
         _wheel_way(axes, one)
     _lamps(axes, one)
     low, high = way.min(axis=0) - _MARGIN_M, way.max(axis=0) + _MARGIN_M
-    axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x of the map, m", ylabel="y, m")
+    axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x in the map, m", ylabel="y, m")
     axes.legend(loc="best", fontsize=8)
 
 
@@ -102,7 +102,7 @@ def _lamps(axes: Any, one: Moment) -> None:
         return
     x, y, _ = light.pose
     used = sum(link.use is LinkUse.ACCEPTED for link in light.links)
-    axes.plot(x, y, "*", color="gold", markeredgecolor="k", markersize=14, label=f"by light alone ({used} lamps)")
+    axes.plot(x, y, "*", color="gold", markeredgecolor="k", markersize=14, label=f"light solution ({used} lamps)")
     if light.sigma is not None:
         turn = np.linspace(0.0, 2.0 * np.pi, 60)
         axes.plot(x + 2 * light.sigma[0] * np.cos(turn), y + 2 * light.sigma[1] * np.sin(turn), color="goldenrod")
@@ -142,10 +142,10 @@ def _uncertainty(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     sigma = [math.nan if (P := one.snapshot.covariance) is None else math.sqrt(max(P[0], P[2])) for one in told]
     bound = [math.nan if (m := one.snapshot.trust.horizontal_m) is None else m for one in told]
     if np.isnan([*sigma, *bound]).all():
-        _empty(axes, "no sigma and no bound was told")
+        _empty(axes, "no sigma and no protection level was published")
         return
-    axes.plot(seconds, sigma, label="sigma of the place, m")
-    axes.plot(seconds, bound, label="bound on its error, m")
+    axes.plot(seconds, sigma, label="sigma of the position, m")
+    axes.plot(seconds, bound, label="protection level, m")
     axes.set_yscale("log")
     axes.legend(fontsize=7)
 
@@ -175,13 +175,13 @@ def _wheels(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     metres = [math.nan if said is None else said.apart[0] for said in both]
     turned = [math.nan if said is None else math.degrees(said.apart[1]) for said in both]
     if np.isnan(metres).all():
-        _empty(axes, "wheels and laser could not be compared")
+        _empty(axes, "odometry and lidar could not be compared")
         return
     odd = np.array([said is not None and not said.agree for said in both])
     dots = (
         axes.plot(seconds[odd], np.array(metres)[odd], ".", color="tab:red", label="they dissent") if odd.any() else []
     )
-    _two_scales(axes, seconds, ("wheels from laser, m", metres), ("degrees", turned), dots)
+    _two_scales(axes, seconds, ("odometry minus lidar, m", metres), ("degrees", turned), dots)
 
 
 def _light(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
@@ -194,9 +194,9 @@ def _light(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
     gaps = [one.snapshot.trust.gap if said else None for one, said in zip(told, speaks, strict=True)]
     gap = [math.nan if g is None else math.sqrt(g) for g in gaps]
     if np.isnan([*away, *gap]).all():
-        _empty(axes, "light told no place")
+        _empty(axes, "no light solution was available")
         return
-    other = _two_scales(axes, seconds, ("light from pose, m", away), ("in deviations", gap))
+    other = _two_scales(axes, seconds, ("light solution minus pose, m", away), ("in deviations", gap))
     most = math.sqrt(GAP)
     other.axhline(most, color="tab:red", linewidth=0.8)
     other.set_ylim(0.0, max(other.get_ylim()[1], 1.1 * most))  # keep the threshold in view

@@ -48,5 +48,5 @@ def moments(span: Span, utc: float) -> tuple[list[Moment], Rerun]:
                 shown = time.monotonic()
     rerun.finish()
     if not told or math.isinf(told[0].utc):
-        raise NoMoment("no cycle was recorded around then")
+        raise NoMoment("no cycle was recorded around that time")
     return told, rerun

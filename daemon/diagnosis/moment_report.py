@@ -43,11 +43,11 @@ def report(told: Sequence[Moment], utc: float, where: str, wide: float, second: 
         begun, meant = _named(utc, wide)
         when = f"{begun}, {meant}: {_change(one.utc - end_of(utc, wide), changed)}"
     if apart > SECOND_S and changed is None:
-        when = f"{begun}, no cycle had run yet; the first, {apart:.0f} s later"
+        when = f"{begun}, before the first cycle, which ran {apart:.0f} s later"
     elif apart < -SECOND_S:
-        when = f"{begun}, no cycle ran then; the last before it, {-apart:.0f} s earlier"
+        when = f"{begun}, without a cycle; the last one before ran {-apart:.0f} s earlier"
     lines = [f"{when}, cycle of {of_day(one.utc)}, {where}", *([made] if made else []), *_state(told, k)]
-    lines += ["", "witnesses", *(f"  {line}" for line in _witnesses(told, k))]
+    lines += ["", "solutions", *(f"  {line}" for line in _witnesses(told, k))]
     lines += ["", "axes", *(f"  {line}" for line in _axes(told, k))]
     if one.snapshot.light is not None:
         lines += ["", "lamps", *(f"  {line}" for line in _lamps(told, k))]
@@ -69,8 +69,8 @@ def _change(after_s: float, changed: int | None) -> str:
     if changed is None:
         return "nothing changes"
     if after_s < 0.0:
-        return "state, reason or faults first change in it"
-    return f"nothing changes in it, but {after_s:.2f} s after it state, reason or faults do"
+        return "first change of state, reason or faults in it"
+    return f"nothing changes in it; state, reason or faults change {after_s:.2f} s after it"
 
 
 def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
@@ -82,11 +82,11 @@ def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
         yield f"fault {fault} since {_since(told, k, partial(_has, fault))}: {text}{_in_brackets(remedy)}"
     again = one.snapshot.state, Reason(one.snapshot.reason)
     if one.told is not None and one.told not in Reason._value2member_map_:
-        yield f"(reason {one.told} was published, which is not known here: newer software's; told is the replay's)"
+        yield f"(newer software published reason {one.told}, which is unknown here; this is the replay's reason)"
     if again != (one.state, one.reason):
-        yield f"(this was published; the replay itself says {again[0].name}: {_because(again[1])})"
+        yield f"(this was published; the replay gives {again[0].name}: {_because(again[1])})"
     if one.told is None:
-        yield "(published reason and faults were not recorded then: the reason is the replay's, faults are not known)"
+        yield "(the recording has no published reason and faults; the reason is the replay's, and faults are unknown)"
     if one.snapshot.pose is not None:
         x, y, yaw = one.snapshot.pose
         said = f"pose {x:.3f} {y:.3f} m, {math.degrees(yaw):.1f} deg"
@@ -96,10 +96,10 @@ def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
         trust = one.snapshot.trust
         if trust.horizontal_m is not None:
             rests = [name for name in ("laser", "light", "wheels") if getattr(trust, name)]
-            said += f"; not wrong by more than {trust.horizontal_m:.2f} m, which rests on {', '.join(rests)}"
+            said += f"; protection level {trust.horizontal_m:.2f} m by {', '.join(rests)}"
         yield said
     if one.snapshot.trust.places is not None:
-        yield f"the place in the map is looked for: {one.snapshot.trust.places} fit"
+        yield f"relocalisation: {one.snapshot.trust.places} hypotheses"
 
 
 def _because(reason: Reason) -> str:
@@ -113,7 +113,7 @@ def _in_brackets(remedy: str) -> str:
 
 def _fault(number: int) -> tuple[str, str]:
     """Returns meaning and remedy of a fault; newer software may have recorded one that is not known here."""
-    return FAULTS[Fault(number)] if number in Fault._value2member_map_ else ("not known here", "")
+    return FAULTS[Fault(number)] if number in Fault._value2member_map_ else ("unknown to this version", "")
 
 
 def _has(fault: int, one: Moment) -> bool:
@@ -145,35 +145,35 @@ def laser_dissents(one: Moment) -> bool:
 def _laser(told: Sequence[Moment], k: int) -> str:
     latest = next((one for one in reversed(told[: k + 1]) if one.scan is not None and one.fresh), None)
     if latest is None or latest.result is None or latest.result.match is None:
-        return "laser   no scan in all that time"
+        return "lidar    no scan in this time"
     match, ago = latest.result.match, told[k].utc - latest.utc
     when = f", {ago:.2f} s ago" if ago > 0.3 else ""
     gone = told[k].state is State.NO_LIDAR or told[k].reason in GONE
     silent = latest is not told[k] and told[k].snapshot.lidar_ok is False
-    before = f"silent for {ago:.{1 if ago >= 1.0 else 2}f} s; before: "
+    before = f"no data for {ago:.{1 if ago >= 1.0 else 2}f} s; before: "
     if not match.ok:
-        said = f"came to nothing: {match.reason.value} ({match.queries} points)"
-        return f"laser   {before}a scan {said}" if silent else f"laser   DISSENTS: the scan{when} {said}"
+        said = f"without a match: {match.reason.value} ({match.queries} points)"
+        return f"lidar    {before}a scan {said}" if silent else f"lidar    DISAGREES: a scan{when} {said}"
     x, y, yaw = match.correction.tolist()
     moved = f"moved the prediction by {1e3 * math.hypot(x, y):.0f} mm, {math.degrees(yaw):.2f} deg"
     fit = f"{match.inliers} of {match.queries} points fit, residual {1e3 * match.residual_m:.0f} mm"
-    word = before if silent else f"speaks{' again, not steadily yet' if gone else when}: "
-    return f"laser   {word}{fit}, {moved}"
+    word = before if silent else f"matches{' again, not steady yet' if gone else when}: "
+    return f"lidar    {word}{fit}, {moved}"
 
 
 def _wheels(one: Moment) -> str:
     said = one.wheels
     if one.snapshot.odometry_ok is None:
-        return "wheels  there is no odometry"
+        return "odometry not configured"
     if one.snapshot.odometry_ok is False:
-        return "wheels  silent"
+        return "odometry without data"
     if said is None:
-        return "wheels  cannot be compared with the laser: two seconds of both, and of all axes, are wanted"
+        return "odometry cannot be compared with the lidar, which needs two seconds of both with all axes known"
     told, seen = _motion(said.wheels), _motion(said.laser)
     away_m, away_rad = said.apart
     apart = f"{away_m:.2f} m, {math.degrees(away_rad):.1f} deg apart"
-    word = "agree with the laser" if said.agree else "DISSENT"
-    return f"wheels  {word}: in {said.seconds:.1f} s they told {told}, the laser {seen}; {apart}"
+    word = "agrees with the lidar" if said.agree else "DISAGREES"
+    return f"odometry {word}: in {said.seconds:.1f} s odometry moved {told}, the lidar {seen}; {apart}"
 
 
 def _motion(T: Array) -> str:
@@ -194,17 +194,19 @@ def _light(one: Moment) -> str:
     light = one.snapshot.light
     assert light is not None
     if one.snapshot.adc_ok is False:
-        return "light   silent: no samples come"
+        return "light    without data: no samples arrive"
     away, gap = light_apart(one), one.snapshot.trust.gap
     if away is None:
-        return f"light   tells no place ({light.fix.name}, {light.used} lamps used)"
-    far = f"its place is {away[0]:.2f} m, {math.degrees(away[1]):.1f} deg from the pose"
+        return f"light    has no solution ({light.fix.name}, {light.used} lamps used)"
+    far = f"its position is {away[0]:.2f} m, {math.degrees(away[1]):.1f} deg from the pose"
     against = sum(link.use in AGAINST for link in light.links)
-    used = f"{light.fix.name}, {light.used} lamps used" + (f", {against} speak against the place" if against else "")
+    used = f"{light.fix.name}, {light.used} lamps used" + (
+        f", {against} are inconsistent with the pose" if against else ""
+    )
     if gap is None:
-        return f"light   {used}; {far}"
-    word = "DISSENTS" if gap > GAP or against > light.used else "agrees"
-    return f"light   {word}: {far}, {math.sqrt(gap):.1f} deviations; {used}"
+        return f"light    {used}; {far}"
+    word = "DISAGREES" if gap > GAP or against > light.used else "agrees"
+    return f"light    {word}: {far}, {math.sqrt(gap):.1f} sigma; {used}"
 
 
 def _axes(told: Sequence[Moment], k: int) -> Iterator[str]:
@@ -215,7 +217,7 @@ def _axes(told: Sequence[Moment], k: int) -> Iterator[str]:
     match = None if result is None else result.match
     if match is not None and match.ok and len(blind := match.blind_directions()):
         said = "; ".join(_direction(row) for row in blind.tolist())
-        yield f"this scan says nothing {said} (odom frame)"
+        yield f"this scan does not determine the pose {said} (odom frame)"
 
 
 def _known(axis: int, one: Moment) -> bool:
@@ -225,7 +227,7 @@ def _known(axis: int, one: Moment) -> bool:
 def _direction(row: list[float]) -> str:
     x, y, turn = row
     if abs(turn) > 0.7:
-        return "of the heading"
+        return "in heading"
     return f"along {math.degrees(math.atan2(y, x)) % 180.0:.0f} deg"
 
 
@@ -245,7 +247,7 @@ def _link(link: LightLink) -> str:
     name = f"code {link.code}" if link.lamp_id is None else f"lamp {link.lamp_id}"
     if link.residual is None:
         return name
-    again = "; fits again, and is used when it goes on so" if link.use in AGAINST and abs(link.residual) < FITS else ""
+    again = "; consistent again, used if this continues" if link.use in AGAINST and abs(link.residual) < FITS else ""
     return f"{name} ({math.exp(link.residual):.2f} of expected{again})"
 
 
@@ -254,7 +256,7 @@ def _listed(changes: list[tuple[bool, str]]) -> Iterator[str]:
     minor = [k for k, (grave, _) in enumerate(changes) if not grave]
     out = set(minor[: max(0, len(changes) - MOST)])
     if out:
-        yield f"... {len(out)} more, of axes, witnesses, lamps"
+        yield f"... {len(out)} more, of axes, solutions, lamps"
     yield from (text for k, (_, text) in enumerate(changes) if k not in out)
 
 
@@ -274,7 +276,7 @@ def changes(told: Sequence[Moment]) -> Iterator[tuple[float, bool, str]]:
 
 
 def _published(before: Moment, one: Moment) -> Iterator[str]:
-    yield from (f"order {order}" for order in one.orders)
+    yield from (f"command {order}" for order in one.orders)
     if (before.state, before.reason) != (one.state, one.reason):
         yield f"{one.state.name}: {_because(one.reason)}"
     for sign, fault in faults_changed(before, one):
@@ -288,17 +290,17 @@ def _changed(before: Moment, one: Moment) -> Iterator[str]:
             yield f"{name} {'known' if new.known[axis] else 'unknown'}"
     agreed, agrees = (None if m.wheels is None else m.wheels.agree for m in (before, one))
     if agrees is False and agreed is not False:
-        yield "the wheels begin to dissent"
+        yield "odometry begins to disagree"
     if laser_dissents(one) and not laser_dissents(before):
         assert one.result is not None
         assert one.result.match is not None
-        yield f"a scan comes to nothing: {one.result.match.reason.value}"
+        yield f"a scan has no match: {one.result.match.reason.value}"
     if new.loop_counter != old.loop_counter:
-        yield f"a loop is closed, keyframe {new.loop_new} on {new.loop_old}"
+        yield f"loop closure, keyframe {new.loop_new} on {new.loop_old}"
     if new.jumps != old.jumps and new.pose is not None and old.pose is not None:
         yield f"the pose jumps by {math.dist(new.pose[:2], old.pose[:2]):.2f} m"
     if one.dropped:
-        yield f"{one.dropped} scans came too fast and were left out"
+        yield f"{one.dropped} scans were skipped, because newer ones had arrived"
     yield from _lamps_changed(old, new)
 
 

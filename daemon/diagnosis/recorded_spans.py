@@ -76,7 +76,7 @@ def spans(folder: Path) -> list[Span]:
         except (DataInvalid, DeviceMissing) as error:  # an active ring removes segments meanwhile
             if len(runs) == 1:
                 raise
-            console.say(f"{error}: passed over")
+            console.say(f"{error}; this folder is ignored")
     return found
 
 
@@ -125,10 +125,12 @@ def _end(recording: Recording, begin: float) -> float:
 def _begun(path: Path, header: dict[str, Any]) -> diagnosis_utc.Pair:
     """Returns the start of a run by its monotonic clock and in UTC, both in s."""
     if not {"t_mono", "t_utc"} <= header.keys():
-        problem = "its head does not say when it began, so no moment can be found in it"
-        raise DataInvalid(str(path), problem, "replay it as a whole: lumiloop replay")
+        problem = "its head has no start time, so times cannot be found in it"
+        raise DataInvalid(str(path), problem, "replay the whole recording: lumiloop replay")
     if (pair := diagnosis_utc.pair_of(header["t_mono"], header["t_utc"])) is None:
-        raise DataInvalid(str(path), "its head says no time that can be", "replay it as a whole: lumiloop replay")
+        raise DataInvalid(
+            str(path), "its head has an invalid start time", "replay the whole recording: lumiloop replay"
+        )
     return pair
 
 
@@ -155,7 +157,9 @@ def find(recorded: list[Span], words: str, folder: Path) -> tuple[Span, float, f
         part = {one[0].path: one[0] for one in sorted(here, key=lambda one: one[3])}
         there = [one for one in here if one[0] is part[one[0].path]]
         return max(there, key=_has_before)[:3]
-    raise NoMoment(f"{words}: not in what is recorded in {folder}; there is\n" + "\n".join(map(_listed, recorded)))
+    raise NoMoment(
+        f"{words}: no recording in {folder} covers this time; available:\n" + "\n".join(map(_listed, recorded))
+    )
 
 
 def _has_before(found: tuple[Span, float, float, bool]) -> tuple[float, float]:
@@ -166,7 +170,7 @@ def _has_before(found: tuple[Span, float, float, bool]) -> tuple[float, float]:
 
 def _listed(span: Span) -> str:
     """Returns a line on a recording."""
-    came = f", after the clock was set by {span.came:+.3f} s" if span.came else ""
+    came = f", after a clock step of {span.came:+.3f} s" if span.came else ""
     begin, end = moment.clock(span.begin), moment.clock(span.end)
     return f"  {begin} to {end}, {span.end - span.begin:.0f} s  {span.path.name}{came}"
 
@@ -211,7 +215,7 @@ def meant(words: str, span: Span) -> list[float]:
         return _instants(datetime.fromisoformat(text))
     except (ValueError, OverflowError) as error:
         raise NoMoment(
-            f"{words}: not a time; write 21:14:07, 2026-11-21T21:14:07Z, or seconds since the beginning"
+            f"{words}: not a time; give 21:14:07, 2026-11-21T21:14:07Z, or seconds since the start"
         ) from error
 
 

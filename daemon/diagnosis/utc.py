@@ -63,7 +63,7 @@ def said(begin: float, came: float, end: float, gone: float) -> list[str]:
     """
     steps = ((came, begin, "after"), (gone, end, "before"))
     return [
-        f"the clock was set by {step:+.3f} s, by {clock(utc)} at the latest; all times here are as {side} that"
+        f"the clock was set by {step:+.3f} s before {clock(utc)}; all times here are those {side} the step"
         for step, utc, side in steps
         if step
     ]

@@ -130,8 +130,8 @@ def _load(now: Vitals, before: Vitals) -> str:
     """Returns what the computer's time went into, between two samples."""
     cycles, over = now.cycles - before.cycles, now.overruns - before.overruns
     span = now.t_mono - before.t_mono
-    waited = f"other programs had the processor for {now.waited - before.waited:.1f} of {span:.0f} s"
-    return f"{waited}, {over} of {cycles} cycles were over their budget"
+    waited = f"other programs used the processor for {now.waited - before.waited:.1f} of {span:.0f} s"
+    return f"{waited}, {over} of {cycles} cycles exceeded their budget"
 
 
 def _words(fault: Fault, now: Vitals) -> str:
@@ -145,7 +145,7 @@ def _words(fault: Fault, now: Vitals) -> str:
     if fault in (Fault.LIDAR_TURNED, Fault.ODOMETRY_SCALE) and now.slow is not None:
         return _of_mount(now.slow) if fault is Fault.LIDAR_TURNED else _of_wheels(now.slow)
     late = fault is (Fault.LIDAR_LATE if now.lag > 0.0 else Fault.ODOMETRY_GAPS)
-    return f"scans are {now.lag:+.2f} s late against the wheels" if now.lag and late else ""
+    return f"scan stamps are late by {now.lag:+.2f} s against odometry" if now.lag and late else ""
 
 
 def _of_mount(slow: SlowErrors) -> str:

@@ -63,163 +63,172 @@ class Fault(IntEnum):
 
 FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.NONE: ("no fault", ""),
-    Fault.LIDAR_MISSING: ("the lidar is not there", "check power, cable and `lidar.device`; run `lumiloop probe`"),
+    Fault.LIDAR_MISSING: ("no lidar is found", "check power, cable and `lidar.device`; run `lumiloop probe`"),
     Fault.LIDAR_REFUSED: (
-        "the lidar's port may not be used, or its network address turns the connection away",
-        "serial: join the group dialout; Ethernet: is it on, is the port right, is it another client's? close what "
-        "else uses it, or name another `lidar.device`",
+        "access to the lidar is denied, or its network address refuses the connection",
+        "serial: add the user to group dialout, and close other programs on the port; Ethernet: check power, "
+        "address and port, and disconnect other clients",
     ),
     Fault.LIDAR_BROKEN: (
-        "the lidar reports a fault of its own, or its port is open and nothing answers",
-        "it starts up for some seconds after power-on; else check its power and cable, power it off and on; if that "
-        "does not help, replace it",
+        "the lidar reports an internal fault, or it does not answer on its open port",
+        "wait some seconds after power-on, then check power and cable and power it off and on; replace it if "
+        "the fault persists",
     ),
-    Fault.LIDAR_SILENT: ("the lidar is connected and sends no valid scan", "power it off and on; check the cable"),
+    Fault.LIDAR_SILENT: ("the lidar is connected, but sends no valid scan", "power it off and on; check the cable"),
     Fault.LIDAR_GARBLED: ("more than 5 % of the lidar's frames are damaged", "check cable, shielding and USB hub"),
     Fault.LIDAR_GAPS: ("more than 2 % of the lidar's scans are missing", "check the computer's load and the line rate"),
     Fault.LIDAR_LATE: (
-        "scans arrive more than two periods after they were measured, or are all stamped late against the wheels",
-        "take load off the computer; look for a slow line, a USB hub or a network in between, and for a driver or "
-        "gateway that stamps scans at arrival, not when they were measured",
+        "scans arrive more than two periods after their measurement, or their stamps are late against odometry",
+        "reduce the load of the computer and check line, USB hub and network; a driver or gateway must stamp "
+        "scans at measurement, not at arrival",
     ),
     Fault.LIDAR_MISFIT: (
-        "what the lidar measures does not fit the map where the robot must be, or anywhere after a start",
-        "was the robot moved by hand, or does it drive where the map knows nothing yet? is the lidar covered, shifted "
-        "on its mount, or does it measure wrongly?",
+        "scans do not match the map at the expected pose, or anywhere after a start",
+        "check whether the robot was moved by hand or is outside the mapped area; check the lidar's window and mount",
     ),
     Fault.LIDAR_TURNED: (
         "the lidar is not mounted as configured",
-        "measure its mount, or record a drive and run `lumiloop calibrate --lidar-mount`; correct `lidar.mount`",
+        "measure the mount, or record a drive and run `lumiloop calibrate --lidar-mount`; then correct `lidar.mount`",
     ),
     Fault.ADC_BUS_MISSING: (
-        "the photodiode's I2C bus is not there",
-        "check `photodiode.bus`; is I2C enabled, is the adapter plugged in, does the bus server run?",
+        "the photodiode's I2C bus is not found",
+        "check `photodiode.bus`, that I2C is enabled, that the adapter is plugged in, and that the bus server runs",
     ),
     Fault.ADC_BUS_REFUSED: (
-        "the photodiode's I2C bus may not be used, or cannot do what is needed",
-        "join the group i2c, unbind what else uses the converter, or use an I2C controller of the processor",
+        "access to the photodiode's I2C bus is denied, or the adapter lacks a needed function",
+        "add the user to group i2c, unbind other drivers from the converter, or use an I2C controller of the processor",
     ),
     Fault.ADC_MISSING: (
         "no converter answers on the photodiode's bus",
         "check its power and wiring, and `photodiode.converter`; run `lumiloop probe`",
     ),
-    Fault.ADC_WRONG: ("another chip answers than `photodiode.converter` says", "run `lumiloop probe`, correct the key"),
+    Fault.ADC_WRONG: (
+        "the converter is of another type than `photodiode.converter`",
+        "run `lumiloop probe` and correct the key",
+    ),
     Fault.ADC_BUS_STUCK: (
-        "the photodiode's bus hangs",
-        "switch the converter's power off and on; look for SDA or SCL held low",
+        "the photodiode's bus is stuck",
+        "switch the converter's power off and on; check whether SDA or SCL is held low",
     ),
     Fault.ADC_BUS_FAULTY: (
         "reads of the photodiode's converter fail",
         "check wiring, pull-ups and cable length; read the log",
     ),
-    Fault.ADC_SILENT: ("the photodiode's converter is connected and delivers nothing", "read the log"),
+    Fault.ADC_SILENT: ("the photodiode's converter is connected, but delivers no samples", "read the log"),
     Fault.ADC_GARBLED: (
-        "the converter's words are damaged, or another kind of chip sends them",
+        "the converter's data words are damaged, or come from another type of converter",
         "check `photodiode.converter`, wiring and pull-ups",
     ),
     Fault.NO_SIGNAL: (
-        "the photodiode gives no signal: dark, dazzled, or a dead converter",
-        "look for a cover, for lamps off, for glaring light; a DC channel (`photodiode.level`) would tell which",
+        "the photodiode gives no signal: no light, saturation, or a defective converter",
+        "check for a cover, for lamps that are off, and for glare; a DC channel (`photodiode.level`) "
+        "distinguishes them",
     ),
-    Fault.DARK: ("no light reaches the photodiode", "look for a cover, a broken cable, lamps off"),
+    Fault.DARK: ("no light reaches the photodiode", "check for a cover, a broken cable, and lamps that are off"),
     Fault.DAZZLED: ("the photodiode's amplifier is saturated", "shade the photodiode or lower the gain"),
     Fault.CLIPPED: (
-        "more than a fifth of the samples are at the rails",
-        "too much modulated or flickering light: shade the photodiode or lower the gain",
+        "more than 20 % of the samples are at the limits of the converter",
+        "reduce modulated or flickering light: shade the photodiode or lower the gain",
     ),
     Fault.ADC_RATE: (
-        "the converter is not clocked as the air interface needs it",
-        "set SCL to 18 times the sample rate of `photodiode.profile`: 400 kHz for A",
+        "the converter's sample rate does not fit the air interface",
+        "set the SCL clock to 18 times the sample rate of `photodiode.profile`: 400 kHz for A",
     ),
     Fault.ADC_STALLS: (
-        "the bus stands still inside many blocks of samples",
-        "take load off the computer, or serve the bus from a process of its own: python -m hal.bus.i2c_server",
+        "the bus pauses within many blocks of samples",
+        "reduce the load of the computer, or serve the bus from a separate process: python -m hal.bus.i2c_server",
     ),
-    Fault.ADC_GAPS: ("more than 2 % of the blocks of samples are lost", "take load off the computer"),
+    Fault.ADC_GAPS: ("more than 2 % of the blocks of samples are lost", "reduce the load of the computer"),
     Fault.NO_LAMPS: (
-        "there is light, and no lamp in it can be decoded",
-        "are coded lamps on and in view? `photodiode.profile` must be that of the lamps",
+        "light is received, but no lamp can be decoded",
+        "check that coded lamps are on and in view, and that `photodiode.profile` is theirs",
     ),
     Fault.SURVEY_CONTRADICTED: (
-        "what is received does not fit the survey",
-        "is `lights.survey` that of this building? calibrate anew: lumiloop calibrate",
+        "the received light does not fit the survey",
+        "check that `lights.survey` is the survey of this building; calibrate again: lumiloop calibrate",
     ),
     Fault.TWIN_LAMPS: (
         "two lamps with one code are in view",
-        "give one of them another code; read the links: lumiloop status",
+        "give one of them another code; `lumiloop status` lists the links",
     ),
     Fault.LAMP_MOVED: (
-        "a lamp does not shine as surveyed",
-        "moved or exchanged? the log names it; survey it anew",
+        "the light of a lamp differs from its survey",
+        "the log names the lamp: check whether it was moved or exchanged, then survey it again",
     ),
-    Fault.LAMP_DEAD: ("a lamp is not received where it must be", "the log names it: replace it or switch it on"),
-    Fault.ODOMETRY_SILENT: ("configured odometry does not arrive", "check its sender and `odometry.port`"),
-    Fault.ODOMETRY_JUMPS: ("odometry has jumped", "its sender was restarted, or two senders use `odometry.port`"),
+    Fault.LAMP_DEAD: (
+        "a lamp is not received where it is expected",
+        "the log names the lamp: switch it on or replace it",
+    ),
+    Fault.ODOMETRY_SILENT: ("odometry is configured, but does not arrive", "check its sender and `odometry.port`"),
+    Fault.ODOMETRY_JUMPS: (
+        "the odometry pose has jumped",
+        "check whether its sender was restarted, or two senders use `odometry.port`",
+    ),
     Fault.ODOMETRY_DISAGREES: (
-        "odometry and laser disagree",
-        "wheel slip; if it lasts, check odometry scale and lidar mount",
+        "odometry and lidar disagree about the motion",
+        "check for wheel slip; if it persists, check odometry scale and lidar mount",
     ),
     Fault.ODOMETRY_GAPS: (
-        "odometry readings are lost, late, stamped late against the scans, or come more seldom than before",
-        "check the network and the sender's load; send ten readings per second or more, at once and stamped when they "
-        "were measured: does something on their way stamp them at arrival?",
+        "odometry readings are lost, late, less frequent than before, or have late stamps",
+        "check the network and the sender's load; send ten readings per second or more, without delay, "
+        "stamped at measurement and not at arrival",
     ),
     Fault.ODOMETRY_SCALE: (
-        "odometry is wrong by a constant factor or turns by itself; the pose is corrected for it",
-        "measure wheels and track, or record a drive and run `lumiloop calibrate --odometry`; correct its sender",
+        "odometry has a constant scale error or drift, which is corrected in the pose",
+        "measure wheels and track, or record a drive and run `lumiloop calibrate --odometry`; then correct its sender",
     ),
     Fault.PROTECTION_ALERT: (
-        "the position error may be above the limit that is set, `integrity.alert_m`",
-        "read state and reason; drive to where the pose is known, or set a limit that the place allows",
+        "the protection level is above `integrity.alert_m`, or there is none",
+        "read state and reason; drive to where the pose is known, or set a higher limit",
     ),
-    Fault.LOOP_STALLED: ("the process did not get to run for two scan periods", "take load off the computer"),
-    Fault.OVERRUNS: ("more than 5 % of the cycles exceed their budget", "take load off the computer"),
-    Fault.WORKER_FAILED: ("background work has failed", "read the log; please report it"),
+    Fault.LOOP_STALLED: ("the process could not run for two scan periods", "reduce the load of the computer"),
+    Fault.OVERRUNS: ("more than 5 % of the cycles exceed their budget", "reduce the load of the computer"),
+    Fault.WORKER_FAILED: ("a background job has failed", "read the log and report the defect"),
     Fault.OVERLOADED: (
-        "map work, or the laser itself, is left out for lack of time",
-        "take load off the computer, or raise `cycle.budget_ms`; the stages' times are published",
+        "the daemon skips map work or the lidar for lack of computing time",
+        "reduce the load of the computer, or raise `cycle.budget_ms`; the stage times are published",
     ),
     Fault.PART_FAILED: (
-        "a part of the daemon has failed and is started again and again",
-        "read the log, which names it: is `odometry.port` taken by another program? a defect: please report it",
+        "a component of the daemon has failed and is restarted repeatedly",
+        "the log names the component: check whether another program uses `odometry.port`; otherwise report the defect",
     ),
     Fault.COMPUTER_SLOW: (
-        "the computer is too slow for its work, or other programs take its time",
-        "end other programs or move them to another computer; what follows from it is over with it",
+        "the computer is too slow, or other programs use its processor",
+        "end other programs or move them to another computer; faults that follow from this one end with it",
     ),
     Fault.NO_DESCRIPTORS: (
-        "no file descriptors are left to the daemon, or hardly any",
-        "end clients that keep many connections open, or raise `LimitNOFILE=` of the service (`ulimit -n` in a shell)",
+        "the daemon has almost no free file descriptors",
+        "end clients with many open connections, or raise `LimitNOFILE=` of the service (`ulimit -n` in a shell)",
     ),
     Fault.PUBLISHER_FAILED: (
         "a publisher cannot send or listen",
-        "read the log, which names it: is the port, or the stream's socket, taken by another program or daemon? can "
-        "all of `pose.receivers` be reached (the network's cable, a name)?",
+        "the log names it: check whether another program or daemon uses the port or the stream's socket; "
+        "check that all `pose.receivers` can be reached",
     ),
     Fault.RECORDER_FAILED: (
-        "the recording cannot be written",
-        "free disk space, let the daemon write there (owner, mode, a disk that is mounted read-only), or name another "
-        "directory; the log says which",
+        "the daemon cannot write the recording",
+        "read the log, then free disk space, correct owner and mode of the directory or the mount, or name "
+        "another directory",
     ),
     Fault.MAP_NOT_SAVED: (
-        "the map cannot be saved; what was saved before stays",
-        "read the log; free disk space, end another daemon that keeps its maps there, or name another `map.folder`",
+        "the daemon cannot save the map; the stored map remains",
+        "read the log, then free disk space, end another daemon with the same folder, or name another `map.folder`",
     ),
     Fault.MAP_REFUSED: (
-        "a stored map cannot be used",
-        "the log names the file, why, and what to do; without one a new map is begun",
+        "the daemon cannot use a stored map",
+        "the log names the file, the cause and the remedy; without a stored map the daemon begins a new one",
     ),
     Fault.POSE_NOT_KEPT: (
-        "the pose cannot be kept for the next start",
-        "read the log; free disk space, or name another `map.folder` that may be written",
+        "the daemon cannot store the pose for the next start",
+        "read the log, then free disk space, or name another `map.folder` with write access",
     ),
     Fault.FLIGHT_RECORDER_FAILED: (
-        "the flight recorder cannot keep a state or a dump",
-        "free disk space where it records, see the log for what is in the way",
+        "the flight recorder cannot write a checkpoint or a dump",
+        "free disk space in its directory; the log gives the cause",
     ),
     Fault.THREAD_HANGS: (
-        "a thread of the daemon does not come back",
-        "the log names it: look for a disk or a bus that hangs; a computation that hangs ends in a restart",
+        "a thread of the daemon does not respond",
+        "the log names the thread: check disk and bus; the watchdog restarts the daemon if a computation does not end",
     ),
 }
 """Meaning and remedy of every fault."""
@@ -227,7 +236,7 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
 
 def describe_over(fault: Fault, seconds: float) -> str:
     """Log line of a fault that is over, with its duration in s."""
-    return f"over: fault {int(fault)}: {FAULTS[fault][0]}; it lasted {seconds:.0f} s"
+    return f"over: fault {int(fault)}: {FAULTS[fault][0]}. It lasted {seconds:.0f} s"
 
 
 def describe_consequence(fault: Fault, cause: Fault) -> str:

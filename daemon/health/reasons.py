@@ -39,7 +39,7 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
     Reason.OPENING_LIDAR: ("the lidar is being opened", "wait a few seconds"),
     Reason.LIDAR_UNREACHABLE: ("the lidar cannot be opened", "read the log, then run `lumiloop probe`"),
     Reason.LIDAR_SILENT: (
-        "no valid scan for three scan periods, or scans do not arrive steadily yet",
+        "no valid scan for three scan periods, or scans are not steady yet",
         "check the lidar's power and cable",
     ),
     Reason.UNPROVED: ("the pose follows the lidar; it is not confirmed yet", "wait, or drive a metre or two"),
@@ -54,11 +54,11 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
     ),
     Reason.ODOMETRY_SILENT: ("odometry is configured, but does not arrive", "check its sender and `odometry.port`"),
     Reason.UNCERTAIN: (
-        "the robot may have moved further than any sensor has measured",
+        "the robot may have moved further than the sensors have measured",
         "set the pose, or drive back to where it was known; wheel odometry bridges such gaps",
     ),
     Reason.NO_WITNESS: (
-        "nothing has confirmed the pose for too long",
+        "no sensor has confirmed the pose for too long",
         "set the pose, or drive back to where it was known",
     ),
     Reason.SEVERAL_PLACES: ("several poses are possible", "drive on until only one remains"),
@@ -72,12 +72,12 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
         "check the converter's power and bus; read the fault",
     ),
     Reason.LIGHT_DARK: (
-        "light has not determined the position for a while: too few lamps are received, or they disagree",
-        "check that the lamps are on, the photodiode is free and this area is surveyed; then drive a metre or two",
+        "light does not determine the position: too few lamps are received, or they disagree",
+        "check the lamps, the photodiode and the survey of this area; then drive a metre or two",
     ),
     Reason.LIGHT_DISAGREES: (
         "light and pose disagree about the position",
-        "wait some seconds; if it persists or returns, check for moved lamps, a wrong survey, or a wrong scan match",
+        "wait some seconds; if it persists or returns, check for moved lamps, a wrong survey or a wrong scan match",
     ),
     Reason.LIGHT_LOST: (
         "the received light does not fit the position; the light filter restarts",
@@ -92,7 +92,7 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
         "give the command RESUME",
     ),
     Reason.OVERLOADED: (
-        "the computer is too slow: the lidar is left out, the pose continues by light and odometry",
+        "the computer is too slow: the daemon skips the lidar and uses light and odometry",
         "reduce the load of the computer, or raise `cycle.budget_ms`",
     ),
 }

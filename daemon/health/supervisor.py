@@ -50,7 +50,7 @@ class Supervisor:
                 self._lost(name, f"{name}: {error}")
             except Exception as error:
                 if name not in self.failed or repr(error) != said:
-                    log.exception("%s has failed; it is restarted until it works", name)
+                    log.exception("component %s has failed; the daemon restarts it until it works", name)
                 said = repr(error)
                 self._lost(name, "")
             else:
@@ -72,7 +72,7 @@ class Supervisor:
     def _lost(self, name: str, line: str) -> None:
         self.restarts[name] += 1
         if line and name not in self.failed:
-            log.warning("%s; trying again until it works", line)
+            log.warning("%s; the daemon tries again until it works", line)
         self.failed.add(name)
 
     def _returned(self, name: str) -> None:

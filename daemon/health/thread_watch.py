@@ -57,10 +57,10 @@ class ThreadWatch:
         self.hanging = frozenset(one.thread for one in self._watched if _busy(one, now) > one.limit_s)
         for one in self._watched:
             if one.thread in self.hanging - before:
-                end = "; the watchdog will end the daemon" if one.thread in CURED else ""
-                log.error("thread %s has not come back for %.0f s%s", one.thread.name, one.limit_s, end)
+                end = "; the watchdog ends the daemon soon" if one.thread in CURED else ""
+                log.error("thread %s has not responded for %.0f s%s", one.thread.name, one.limit_s, end)
         for thread in before - self.hanging:
-            log.info("thread %s has come back", thread.name)
+            log.info("thread %s responds again", thread.name)
         return self.hanging
 
     @property

@@ -29,8 +29,8 @@ ENOUGH: Final = 3
 _ODD: Final = ((LinkState.REJECTED, Fault.LAMP_MOVED), (LinkState.MISSING, Fault.LAMP_DEAD))
 _UNHEARD: Final = (LinkState.FAINT, LinkState.MISSING)
 _SAID: Final = {
-    Fault.LAMP_MOVED: "does not shine as surveyed: moved, exchanged, or its power is another",
-    Fault.LAMP_DEAD: "is not received where it must be: dead, switched off, or covered",
+    Fault.LAMP_MOVED: "differs from its survey: it was moved, exchanged, or its power has changed",
+    Fault.LAMP_DEAD: "is not received where it is expected: defective, off, or covered",
 }
 
 
@@ -111,7 +111,7 @@ class LampWatch:
                     self._find(link, fault, t_mono)
             if link.state is LinkState.ACCEPTED and link.lamp_id in self.odd:
                 del self.odd[link.lamp_id]
-                log.info("lamp %d (code %d) is received as it should be again", link.lamp_id, link.code)
+                log.info("lamp %d (code %d) is received as expected again", link.lamp_id, link.code)
         if self.odd:
             self.odd = {lamp: found for lamp, found in self.odd.items() if t_mono - found[1] < FORGOTTEN_S}
         if lamps:

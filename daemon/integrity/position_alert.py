@@ -76,17 +76,19 @@ class Alarm:
         self.on = True
         if t_mono >= self._expected and not self.said:
             known = bound_m is not None and math.isfinite(bound_m)
-            said = f"it may be {bound_m:.3g} m" if known else "there is no bound on it"
+            said = f"the protection level is {bound_m:.3g} m" if known else "there is no protection level"
             log.warning(
-                "alert: the position error may be above the limit of %.3g m that `integrity.alert_m` sets: %s; stop or "
-                "go slow, read state and reason, and drive to where the pose is known",
-                self.limit_m,
+                "position alert: %s (alert limit `integrity.alert_m`: %.3g m). Stop or slow down, read state "
+                "and reason, and drive to where the pose is known",
                 said,
+                self.limit_m,
             )
             self.said = True
 
     def _clear(self, t_mono: float, bound_m: float) -> None:
         if self.said:
-            log.info("alert over: the position error is below %.3g m, the limit is %.3g m", bound_m, self.limit_m)
+            log.info(
+                "position alert over: the protection level is %.3g m, the alert limit %.3g m", bound_m, self.limit_m
+            )
         self.on = self.said = False
         self._expected = min(self._expected, t_mono)

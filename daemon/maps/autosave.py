@@ -46,10 +46,10 @@ STOP_S: Final = 4.0
 """Time limit in s of the save at the stop; the service manager waits for ten seconds."""
 
 DONE: Final = ""
-NO_MAP: Final = "there is no map yet: drive a metre or two"
-NO_FOLDER: Final = "maps are not kept: `map.folder` is none"
-FIXED: Final = "the map is used as it is: `map.localise` is true"
-ADRIFT: Final = "the place in the stored map is not known yet, and the map has not changed"
+NO_MAP: Final = "the map is still empty; drive a metre or two"
+NO_FOLDER: Final = "maps are not stored, because `map.folder` is none"
+FIXED: Final = "the stored map does not change, because `map.localise` is true"
+ADRIFT: Final = "the pose in the stored map is not known yet, and the map has not changed"
 
 Revision = tuple[int, int, int]
 End = Callable[[Path | None, str], None]
@@ -190,7 +190,7 @@ class MapAutosaver:
                     self._go_on()
                     await self._over.wait()
         if not self._over.is_set():
-            log.error("the map could not be saved within %.0f s of the stop; the one before stays", STOP_S)
+            log.error("the map could not be saved within %.0f s after shutdown began; the previous one remains", STOP_S)
         elif self._store is not None:
             self._store.close()
 
@@ -217,8 +217,8 @@ class MapAutosaver:
         try:
             self._begin(store, state, end)
         except Exception as failure:  # no memory, no thread, or a defect: clients get the reason; retried
-            log.exception("the save of the map cannot begin")
-            end(None, f"the save cannot begin: {failure!r}")
+            log.exception("saving the map cannot begin")
+            end(None, f"saving cannot begin: {failure!r}")
 
     def _busy(self, busy: bool) -> None:
         """Record whether a thread uses the folder."""
@@ -242,7 +242,7 @@ class MapAutosaver:
         try:
             threading.Thread(target=work, name="lumiloop-map", daemon=True).start()
         except Exception:  # no memory, or no thread: the next attempt comes soon
-            log.exception("the folder of maps cannot be looked at")
+            log.exception("the map folder cannot be read")
             self._busy(False)
 
     def _looked(self, store: Store, before: str) -> None:
@@ -251,14 +251,14 @@ class MapAutosaver:
         if self.error == before:
             self.error = store.trouble
         if not store.trouble:
-            log.info("maps can be kept in %s from now on", store.folder)
+            log.info("maps can be stored in %s again", store.folder)
         self._go_on()
 
     def _begin(self, store: Store, state: State, end: End) -> None:
         """Collect the map and start a thread that saves it and calls ``end`` in this one."""
         begun = time.perf_counter()
         image = self._image(state)
-        log.debug("the map was gathered in %.2f ms", 1e3 * (time.perf_counter() - begun))
+        log.debug("the map was copied for saving in %.2f ms", 1e3 * (time.perf_counter() - begun))
         work = partial(self._work, store, image, asyncio.get_running_loop(), end)
         threading.Thread(target=work, name="lumiloop-map", daemon=True).start()
 
@@ -292,8 +292,8 @@ class MapAutosaver:
         except BadMap as failure:
             error = f"{store.folder}: {failure}"
         except Exception as failure:  # a defect in the packing must not end saving for good, and is logged in full
-            log.exception("the map cannot be packed")
-            error = f"it cannot be packed: {failure!r}"
+            log.exception("the map cannot be encoded")
+            error = f"the map cannot be encoded: {failure!r}"
         with contextlib.suppress(RuntimeError):  # the loop has closed: no client waits any more
             loop.call_soon_threadsafe(end, path, error)
 
@@ -316,10 +316,8 @@ class MapAutosaver:
             # retry even without a new revision: the fault ends only when a save succeeds
             self._anew |= self._saved is not None and (self._saved == revision or self._saved[0] != self._map_id())
         if error and not self.error:
-            again = "" if self._last else ", and it is tried again"
-            log.info(
-                "the map cannot be saved: %s; what was saved before stays%s", error, again
-            )  # the fault is the warning
+            again = "" if self._last else "; the daemon tries again"
+            log.info("the map cannot be saved (%s). The stored map remains%s", error, again)  # the fault is the warning
         self.error = error
         for on_done in waiting:
             on_done(error)

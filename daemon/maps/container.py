@@ -52,8 +52,8 @@ class BadMap(Exception):
         remedy: what an operator can do, or what the daemon does. advice: the same for an operator who named the file.
     """
 
-    remedy = "it is kept, and done without"
-    advice = "name another, for instance the generation before it"
+    remedy = "the file is kept, but not used"
+    advice = "name another file, for example the previous generation"
 
 
 class Foreign(BadMap):
@@ -63,8 +63,8 @@ class Foreign(BadMap):
 class Newer(BadMap):
     """A newer version of this software has written the file."""
 
-    remedy = "install that version again, or move the file away"
-    advice = "read it with that version"
+    remedy = "install that version of lumiloop, or move the file away"
+    advice = "read the file with that version of lumiloop"
 
 
 class Damaged(BadMap):
@@ -116,7 +116,7 @@ def unpack(data: bytes, known: Container[str] | None = None) -> dict[str, AnyArr
         packed = memoryview(data)[at : at + length]
         at += length
         if len(packed) != length or zlib.crc32(packed) != crc:
-            raise Damaged(f"the part `{title}`, bytes {at - length} to {at}, is damaged (checksum)")
+            raise Damaged(f"part `{title}`, bytes {at - length} to {at}, is damaged (checksum)")
         arrays[title] = _array(title, packed, dtype.decode("ascii", "replace").rstrip("\0"), (columns, rows, packing))
     if at != len(data):
         raise Damaged(f"{len(data) - at} bytes follow its last part")
@@ -129,10 +129,10 @@ def _bounded(table: bytes, packed: int, known: Container[str] | None) -> None:
     for name, dtype, columns, rows, *_ in ROW.iter_unpack(table):
         title, kind = name.rstrip(b"\0").decode("ascii", "replace"), dtype.decode("ascii", "replace").rstrip("\0")
         if known is not None and title not in known:
-            raise Damaged(f"the part {title!r} is none of version {VERSION}")
+            raise Damaged(f"the part {title!r} is not a part of version {VERSION}")
         size += rows * max(1, columns) * (np.dtype(kind).itemsize if kind in DTYPES else 1)
     if size > min(MOST_BYTES, max(SMALL_BYTES, MOST_RATIO * packed)):
-        raise Damaged(f"its {packed} bytes are said to unpack to {size}: no map is packed so well")
+        raise Damaged(f"its {packed} bytes claim to unpack to {size} bytes, which is impossible")
 
 
 def _head(data: bytes) -> tuple[int, int, int]:
@@ -140,16 +140,16 @@ def _head(data: bytes) -> tuple[int, int, int]:
     if len(data) < HEAD.size:
         if not MAGIC.startswith(data[: len(MAGIC)]):
             raise Foreign("it is not a map file of lumiloop")
-        raise Damaged(f"it ends within its head, after {len(data)} bytes")
+        raise Damaged(f"the file ends in its head, after {len(data)} bytes")
     magic, version, count, crc, total = HEAD.unpack_from(data)
     if magic != MAGIC:
         raise Foreign("it is not a map file of lumiloop")
     if version > VERSION:
-        raise Newer(f"it is of version {version}, and this software knows them up to {VERSION}")
+        raise Newer(f"the file has version {version}; this software reads versions up to {VERSION}")
     if version < 1:
-        raise Damaged(f"there is no version {version}")
+        raise Damaged(f"version {version} does not exist")
     if len(data) != total:
-        raise Damaged(f"it is {len(data)} bytes long and should be {total}: cut off, or lengthened")
+        raise Damaged(f"it is {len(data)} bytes long instead of {total}: truncated or extended")
     return version, count, crc
 
 
@@ -184,11 +184,11 @@ def _array(title: str, packed: memoryview, dtype: str, row: tuple[int, int, int]
     """Decode one array from its blocks; every value of the table is checked before it is used."""
     columns, rows, packing = row
     if dtype not in DTYPES or packing not in (SORTED, DIFFERENCES):
-        raise Damaged(f"the part `{title}` is of an unknown kind ({dtype}, packing {packing})")
+        raise Damaged(f"the part `{title}` has an unknown kind ({dtype}, packing {packing})")
     kind = np.dtype(dtype)
     width = max(1, columns)
     if rows * width * kind.itemsize > MOST_BYTES:
-        raise Damaged(f"the part `{title}` is said to have {rows} rows")
+        raise Damaged(f"the part `{title}` claims to have {rows} rows")
     array = np.empty(rows * width, kind)
     at = done = 0
     while at < len(packed):
@@ -197,7 +197,7 @@ def _array(title: str, packed: memoryview, dtype: str, row: tuple[int, int, int]
         length, count = BLOCK.unpack_from(packed, at)
         at += BLOCK.size
         if done + count > rows or count == 0:
-            raise Damaged(f"the part `{title}` has more rows than it says")
+            raise Damaged(f"the part `{title}` has more rows than its head states")
         content = _unpacked(title, packed[at : at + length], count * width * kind.itemsize)
         by_place = np.frombuffer(content, np.uint8).reshape(kind.itemsize, -1)
         flat = np.ascontiguousarray(by_place.T).reshape(-1).view(kind)
@@ -206,7 +206,7 @@ def _array(title: str, packed: memoryview, dtype: str, row: tuple[int, int, int]
         array[done * width : (done + count) * width] = flat
         at, done = at + length, done + count
     if done != rows:
-        raise Damaged(f"the part `{title}` has {done} rows and should have {rows}")
+        raise Damaged(f"the part `{title}` has {done} rows instead of {rows}")
     return array.reshape(rows, columns) if columns else array
 
 
@@ -216,5 +216,5 @@ def _unpacked(title: str, content: memoryview, size: int) -> bytes:
     except zlib.error as error:
         raise Damaged(f"the part `{title}` cannot be unpacked ({error})") from None
     if len(found) != size:
-        raise Damaged(f"a block of the part `{title}` unpacks to {len(found)} bytes and should to {size}")
+        raise Damaged(f"a block of the part `{title}` unpacks to {len(found)} bytes instead of {size}")
     return found

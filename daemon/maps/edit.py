@@ -59,7 +59,7 @@ def opened(path: Path) -> Stored:
     try:
         return read(path.read_bytes())
     except OSError as error:
-        raise OSError(f"{path}: cannot be read: {said(error)}; name a map file, *.lumimap") from error
+        raise OSError(f"{path}: cannot read the map: {said(error)}; name a map file, *.lumimap") from error
     except BadMap as error:
         raise type(error)(f"{path}: {error}; {error.advice}") from error
 
@@ -69,14 +69,14 @@ def put(path: Path, content: bytes) -> Path:
     try:
         write_whole(path, content)
     except OSError as error:
-        raise OSError(f"{path}: cannot be written: {said(error)}; name another place with --out FILE") from error
+        raise OSError(f"{path}: cannot write the map: {said(error)}; name another file with --out FILE") from error
     return path
 
 
 def keep(settings: Config, content: bytes, map_id: int) -> Path:
     """Store a map in the configured folder; `OSError`, with the remedy, where another process uses it."""
     if not settings.map.kept:
-        raise OSError("`map.folder` is none; name a place with --out FILE")
+        raise OSError("`map.folder` is none; name a file with --out FILE")
     store = Store(stored_maps(settings.map.folder))
     try:
         return store.save(content, map_id)
@@ -94,7 +94,7 @@ def called(text: str) -> str:
     """
     text = text.strip()
     if len(text) > LONGEST_NAME or not text.isprintable():
-        raise Refused(f"a name is one line of at most {LONGEST_NAME} characters")
+        raise Refused(f"a name must be one line of at most {LONGEST_NAME} characters")
     return text
 
 
@@ -125,7 +125,7 @@ def pair_of(text: str) -> tuple[float, float, float, float]:
     except ValueError:
         numbers = []
     if [len(side) for side in sides] != [2, 2] or len(numbers) != 4 or not all(map(math.isfinite, numbers)):
-        raise Refused(f"--point {text}: write X,Y=X',Y', in metres: where it is in the map, and where it should be")
+        raise Refused(f"--point {text}: expected X,Y=X',Y' in metres, the coordinates in the map and the correct ones")
     a, b, c, d = numbers
     return a, b, c, d
 
@@ -137,12 +137,14 @@ def fitted(pairs: list[tuple[float, float, float, float]]) -> Fit:
         Refused: fewer than two points, or all in one place.
     """
     if len(pairs) < 2:
-        raise Refused("two points at least are needed: --point X,Y=X',Y' --point ...; the farther apart the better")
+        raise Refused("at least two points are needed, far apart: --point X,Y=X',Y' --point ...")
     a, b = np.array(pairs)[:, :2], np.array(pairs)[:, 2:]
     p, q = a - a.mean(axis=0), b - b.mean(axis=0)
     wide_p, wide_q = float(np.hypot(*np.ptp(a, axis=0))), float(np.hypot(*np.ptp(b, axis=0)))
     if min(wide_p, wide_q) < LEAST_APART_M:
-        raise Refused(f"the points lie within {min(wide_p, wide_q):.2f} m; take some {LEAST_APART_M:g} m apart or more")
+        raise Refused(
+            f"the points lie within {min(wide_p, wide_q):.2f} m; use points {LEAST_APART_M:g} m apart or more"
+        )
     yaw = math.atan2(float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()), float((p * q).sum()))
     c, s = math.cos(yaw), math.sin(yaw)
     R = np.array(((c, -s), (s, c)))
@@ -161,8 +163,9 @@ def judge(fit: Fit) -> None:
     worst = int(np.argmax(fit.residual_m))
     if abs(fit.scale - 1.0) > TOLERANCE or fit.residual_m[worst] > TOLERANCE_M:
         raise Refused(
-            f"the distances disagree: {100.0 * (fit.scale - 1.0):+.1f} % of the map's, point {worst + 1} is off by "
-            f"{fit.residual_m[worst]:.2f} m; measuring errors are at most {100.0 * TOLERANCE:g} % and {TOLERANCE_M:g} m"
+            f"the distances of the points differ by {100.0 * (fit.scale - 1.0):+.1f} %, and point {worst + 1} "
+            f"has a residual of {fit.residual_m[worst]:.2f} m; measure again, errors must be within "
+            f"{100.0 * TOLERANCE:g} % and {TOLERANCE_M:g} m"
         )
 
 

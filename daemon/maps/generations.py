@@ -31,7 +31,7 @@ OTHERS: Final = 7
 Problem = BadMap | OSError | MemoryError
 """Reason why a map file cannot be used."""
 OLDER: Final = "an older generation"
-CROWDED: Final = f"{OTHERS} maps of other places are newer"
+CROWDED: Final = f"{OTHERS} maps of other areas are newer"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,9 @@ class Examination:
         problem = problem_of(path)
         self.found(path, problem)
         if problem is not None:
-            log.warning("%s cannot be used: %s; it stays, and the generation before it too", path, words_of(problem))
+            log.warning(
+                "%s cannot be used: %s; the daemon keeps it and the previous generation", path, words_of(problem)
+            )
         return problem is None
 
 
@@ -139,7 +141,7 @@ def verify(path: Path, content: bytes) -> None:
         )  # read from the disk, not from the cache of what was just written
         found = file.read()
     if found != content:
-        raise Damaged("what was read back is not what was written: the disk is failing")
+        raise Damaged("the content read back differs from the content written; check the disk")
     read(found)
 
 
@@ -158,7 +160,7 @@ def is_unread(error: Problem) -> bool:
 def said(error: OSError) -> str:
     """Readable reason of an `OSError`."""
     if isinstance(error, BlockingIOError):
-        return "another process keeps its maps there"
+        return "another process stores its maps there"
     return error.strerror or str(error)
 
 

@@ -30,7 +30,7 @@ MAPS_S: Final = 60.0
 class CannotBegin(Damaged):
     """A map that passes every check of its file, but with which the estimator cannot start."""
 
-    remedy = "it is kept, the generation before it is used; please report it, with the file"
+    remedy = "the daemon keeps the file and uses the previous generation; report the defect with the file"
 
 
 def new_state(lights: Lights | None, settings: Settings | None = None, start: Start | None = None) -> State:
@@ -56,7 +56,7 @@ def new_state(lights: Lights | None, settings: Settings | None = None, start: St
         estimator.new_state(settings, setup)  # an error that occurs without the map too is not the map's
         if isinstance(error, MemoryError):
             raise
-        raise CannotBegin(f"it passes every check, but cannot be made into a state: {error!r}") from error
+        raise CannotBegin(f"the file passes every check, but cannot be loaded: {error!r}") from error
 
 
 def begun(lights: Lights | None, settings: Settings, start: Start | None) -> State:
@@ -64,7 +64,7 @@ def begun(lights: Lights | None, settings: Settings, start: Start | None) -> Sta
     try:
         return new_state(lights, settings, start)
     except CannotBegin as error:
-        log.error("the stored map is not used: %s", error)
+        log.error("the daemon does not use the stored map: %s", error)
         return new_state(lights, settings)
 
 
@@ -84,9 +84,9 @@ def _learned(lights: Lights) -> ResidualMap | None:
     try:
         residuals = unpack(lights.residuals, lights.survey, "the residual map beside the survey")
     except ResidualError as error:
-        log.warning("%s; driving without it", error)
+        log.warning("%s; the daemon runs without it", error)
         return None
-    log.info("residual map of %d lamps", len(residuals.lamp_ids))
+    log.info("residual map of %d lamps loaded", len(residuals.lamp_ids))
     return residuals
 
 
@@ -108,11 +108,11 @@ def started(config: MapConfig, lights: Lights | None, mend: bool = True) -> tupl
     start = store.load(judge_for(lights))
     if start is None and config.localise:
         raise NoMap(
-            f"{store.folder}: holds no map that can be used, and `map.localise` is true; let a run without it make "
-            "one, or import one: lumiloop map import"
+            f"{store.folder}: the folder has no usable map, but `map.localise` is true; make a map with "
+            "`map.localise = false`, or use `lumiloop map import`"
         )
     if start is None and store.refused:
-        log.error("no map in %s can be used; a new one is begun", store.folder)
+        log.error("no map in %s can be used; the daemon begins a new one", store.folder)
     if start is not None:
         start = replace(start, localise=config.localise)
         meta = start.stored.meta
@@ -138,8 +138,8 @@ def started_in_time(config: MapConfig, lights: Lights | None) -> tuple[Store | N
     except TimeoutError as error:
         folder = maps_folder(config.folder)
         if config.localise:
-            raise NoMap(f"{folder}: {error.strerror}, and `map.localise` is true") from error
-        log.error("maps in %s cannot be read: %s; a new one is begun", folder, error.strerror)
+            raise NoMap(f"{folder}: {error.strerror}, but `map.localise` is true") from error
+        log.error("maps in %s cannot be read: %s; the daemon begins a new map", folder, error.strerror)
         store = Store(folder)
         store.damaged = True
         return store, None
@@ -153,6 +153,6 @@ def recorded_start(path: Path, sha256: str, lights: Lights | None, localise: boo
     """
     content = read_regular(path, MOST_BYTES)
     if hashlib.sha256(content).hexdigest() != sha256:
-        raise Damaged(f"{path.name} is not the map that the recorded run began with")
+        raise Damaged(f"{path.name} is not the map from the start of the recorded run")
     stored = read(content)
     return Start(content, stored, judge_for(lights)(stored)[1], localise)

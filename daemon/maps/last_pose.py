@@ -94,7 +94,7 @@ def read(path: Path) -> Remembered | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        log.warning("%s cannot be read: %s; the robot is looked for in the whole map", path, error.strerror)
+        log.warning("%s cannot be read: %s; the daemon searches the whole map for the pose", path, error.strerror)
         return None
     slots = [unpacked(content[at : at + _SLOT_BYTES]) for at in (0, _SLOT_BYTES)]
     return max((slot for slot in slots if slot is not None), key=lambda slot: slot.number, default=None)
@@ -248,7 +248,12 @@ class LastPose:
     def _say(self, error: str, defect: Exception | None = None) -> None:
         if error and not self.error:
             level = logging.INFO if defect is None else logging.WARNING  # the fault is the warning
-            log.log(level, "the pose cannot be kept for the next start: %s; it is tried again", error, exc_info=defect)
+            log.log(
+                level,
+                "the pose cannot be stored for the next start: %s; the daemon tries again",
+                error,
+                exc_info=defect,
+            )
         elif self.error and not error:
-            log.info("the pose is kept for the next start again")
+            log.info("the pose is stored for the next start again")
         self.error = error

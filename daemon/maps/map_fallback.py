@@ -15,14 +15,14 @@ from estimator import LoopReason, StepResult
 log = logging.getLogger(__name__)
 
 ASIDE: Final = (
-    "lamps tell the place, and the stored map %08x, made without them, does not say where that lies in it: a new map "
-    "is begun beside it, the robot is looked for in the stored one on the way, and until then nothing is saved"
+    "the light solution gives the pose in the survey, but the stored map %08x is not aligned to the survey. "
+    "The daemon begins a new map and searches for the pose in the stored one. It saves no map until then"
 )
-FOUND: Final = "the robot has been found in the stored map %08x: it lies in the survey's frame now, and is gone on in"
+FOUND: Final = "the pose in the stored map %08x was found. The map is now aligned to the survey, and the daemon uses it"
 LET_GO: Final = (
-    "the robot is nowhere in the stored map %08x, which may be of another place, or of little: what has been mapped "
-    "under lamps since is a map of its own from now on. The stored one stays as it is: SWITCH_MAP, or a start with its "
-    "file alone in the folder, goes back to it"
+    "the pose was not found in the stored map %08x, which may be of another building or too small. The new "
+    "map is now a separate map, and the stored one remains unchanged. To use the stored map, send "
+    "SWITCH_MAP, or start with only its file in the folder"
 )
 
 

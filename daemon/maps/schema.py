@@ -76,8 +76,7 @@ class OtherBuilding(BadMap):
     """The map was made with the survey of another building."""
 
     remedy = (
-        "name the survey that it was made with in `lights.survey`, or another `map.folder`; the command RESET begins "
-        "a new map"
+        "name the survey of this map in `lights.survey`, or another `map.folder`; the command RESET begins a new map"
     )
 
 
@@ -135,7 +134,7 @@ def _meta(tables: Tables) -> Meta:
     try:
         return msgspec.json.decode(tables["meta"].tobytes(), type=Meta)
     except (KeyError, ValueError, msgspec.DecodeError) as error:
-        raise Damaged(f"the part `meta` does not say what map it is ({error})") from None
+        raise Damaged(f"the part `meta` has no valid map identity ({error})") from None
 
 
 def check(tables: Tables) -> None:
@@ -151,7 +150,7 @@ def check(tables: Tables) -> None:
         if array.dtype.str != dtype or (array.shape[1] if array.ndim == 2 else 0) != columns:
             raise Damaged(f"the part `{name}` has the wrong shape")
         if dtype in ("<f8", "<f4") and name != "range.m" and not np.isfinite(array).all():
-            raise Damaged(f"the part `{name}` holds what is no number")
+            raise Damaged(f"the part `{name}` contains a value that is not a number")
     n = {name: len(tables[name]) for name in KINDS}
     for name in KINDS:
         kind = name.partition(".")[0]
@@ -191,7 +190,7 @@ def _check_scans(tables: Tables, n: dict[str, int]) -> None:
 
 def _must(true: bool, name: str) -> None:
     if not true:
-        raise Damaged(f"the part `{name}` does not fit the others")
+        raise Damaged(f"the part `{name}` is inconsistent with the others")
 
 
 def _within(index: AnyArray, count: int) -> bool:
@@ -285,16 +284,16 @@ def against_survey(stored: Stored, survey: Survey) -> tuple[str, frozenset[int]]
     same = len(common) - len(moved)
     if same < SAME_SHARE * min(len(then), len(now)) or same == 0:
         raise OtherBuilding(
-            f"it was made with another survey: of its {len(then)} lamps {same} hang where the present one has them"
+            f"the map was made with another survey: {same} of its {len(then)} lamps agree with the present one"
         )
     other = {k for k in common if then[k] != now[k]} - moved
     gone, new = then.keys() - now.keys(), now.keys() - then.keys()
     words = [
         f"{what}: {', '.join(map(str, sorted(which)[:8]))}{', ...' if len(which) > 8 else ''}"
-        for what, which in (("moved", moved), ("gone", gone), ("new", new), ("of other strength", other))
+        for what, which in (("moved", moved), ("gone", gone), ("new", new), ("with another power", other))
         if which
     ]
-    said = "; ".join(words) or "none, but the receiver or the floor"
+    said = "; ".join(words) or "none, but the receiver or the diffuse floor"
     return f"the survey has changed since, lamps {said}", frozenset(moved | gone | other)
 
 

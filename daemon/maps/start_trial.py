@@ -36,8 +36,8 @@ PROOF_S: Final = 10.0
 """Time in s since loading the map after which the map cannot be the cause of a failure."""
 BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
 LEFT_OUT: Final = (
-    f"{MOST} starts in a row have begun with it, and none has lasted for {PROOF_S:g} s; it is left out, and moved "
-    "aside, for whoever mends that, once a start without it has lasted"
+    f"{MOST} starts in a row with this map have failed within {PROOF_S:g} s. The daemon starts without it, "
+    "and moves it aside after a successful start"
 )
 
 

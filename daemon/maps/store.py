@@ -120,7 +120,7 @@ class Store:
         except OSError as error:
             before, self.trouble = self.trouble, f"{self.folder}: {said(error)}"
             if self.trouble != before:
-                log.error("no map can be kept in %s; mend that, or name another `map.folder`", self.trouble)
+                log.error("no map can be stored in %s; correct that, or name another `map.folder`", self.trouble)
 
     def generations(self) -> list[Generation]:
         """All map files, newest first."""
@@ -153,7 +153,9 @@ class Store:
                 return start
             if not self.trial.out:
                 them = ", ".join(before)
-                log.warning("%s: %d starts without %s have not lasted either; tried again", self.folder, MOST, them)
+                log.warning(
+                    "%s: %d starts without %s have failed too; the daemon tries the map again", self.folder, MOST, them
+                )
 
     def _newest(self, judge: Judge) -> Start | None:
         """As :meth:`load`, without the excluded files."""
@@ -162,7 +164,7 @@ class Store:
             generations = self.generations()
         except OSError as error:
             log.error(
-                "maps in %s cannot be read: %s; mend that, or name another `map.folder`", self.folder, said(error)
+                "maps in %s cannot be read: %s; correct that, or name another `map.folder`", self.folder, said(error)
             )
             self.damaged = True
             return None
@@ -185,14 +187,14 @@ class Store:
                     elsewhere, refused = not generation.number, True  # a file placed by the operator is no generation
                 else:
                     if refused:
-                        log.warning("%s is used, the newest good generation of this map", generation.path)
+                        log.warning("%s is used, the newest valid generation of this map", generation.path)
                     self._origin = generation.path
                     return start
             if not elsewhere:
                 others = ", ".join(sorted(one.path.name for one in generations if one.map_id not in looked))
                 if others:
                     log.warning(
-                        "%s: not looked at, being of other maps: %s; to use one, move the others out",
+                        "%s: files of other maps are not used: %s; to use one, move the others away",
                         self.folder,
                         others,
                     )
@@ -206,7 +208,7 @@ class Store:
         for name in self.trial.lasted():
             with contextlib.suppress(OSError):
                 aside = (self.folder / name).replace(self.folder / (name + BROKEN))
-                log.warning("%s: a start without it has lasted; it is kept for whoever mends that", aside)
+                log.warning("%s: the start without this map was successful; the file is kept for inspection", aside)
 
     def identity(self, generation: Generation) -> int:
         """Identity of the map in a file: from its name, or from the content of a file that an operator placed there.
@@ -226,7 +228,7 @@ class Store:
         Raises:
             BadMap: none is good, or it belongs to another building. OSError: it cannot be read.
         """
-        failure: BadMap | OSError = Foreign(f"there is no map {map_id:08x} in {self.folder}")
+        failure: BadMap | OSError = Foreign(f"no map {map_id:08x} in {self.folder}")
         for generation in self.generations():
             if self.identity(generation) == map_id:
                 try:
@@ -245,13 +247,13 @@ class Store:
         stored = read(content)
         self._examined.found(generation.path, None)
         if generation.number and stored.meta.map_id != generation.map_id:
-            raise Foreign(f"it holds map {stored.meta.map_id:08x}, another than its name says")
+            raise Foreign(f"it contains map {stored.meta.map_id:08x}, which differs from its name")
         words, changed = judge(stored)
         if words:
-            log.warning("%s: %s; what was learned of them is forgotten, the map is used", generation.path, words)
+            log.warning("%s: %s; the daemon discards their learned gains and uses the map", generation.path, words)
         if stored.isolated:
             log.warning(
-                "%s: %d of its submaps are joined with the rest by nothing and are left out",
+                "%s: %d submaps have no edge to the others and are not used",
                 self._copy_aside(generation.path, content),
                 stored.isolated,
             )
@@ -277,7 +279,9 @@ class Store:
         self.damaged = True
         self._examined.found(path, error)
         if not isinstance(error, BadMap):
-            log.error("%s cannot be read: %s; it stays; mend that, or move it away", path, words_of(error))
+            log.error(
+                "%s cannot be read: %s. The daemon keeps the file; correct that, or move it away", path, words_of(error)
+            )
             return
         where = path
         if self._mend and isinstance(error, Damaged | Foreign):
@@ -314,7 +318,7 @@ class Store:
         found = [(int(match[2]), path) for path in self.folder.iterdir() if (match := BROKEN_NAME.fullmatch(path.name))]
         for _, path in sorted(found)[:-MOST_BROKEN]:
             if isinstance(problem_of(path), Damaged):
-                log.warning("%s goes: %d damaged maps are newer", path, MOST_BROKEN)
+                log.warning("%s is removed, because %d damaged maps are newer", path, MOST_BROKEN)
                 path.unlink(missing_ok=True)
 
     def _use(self) -> None:
@@ -334,7 +338,7 @@ class Store:
             try:
                 part.unlink(missing_ok=True)
             except OSError as error:  # harmless: the next map has another name
-                log.warning("%s cannot be removed: %s; it is left there", part, said(error))
+                log.warning("%s cannot be removed: %s; the file remains", part, said(error))
 
     def _next(self) -> int:
         """Number above all that were ever used, damaged files included."""
@@ -347,7 +351,7 @@ class Store:
             try:
                 generation.path.unlink(missing_ok=True)
             except OSError as error:
-                log.warning("%s cannot be deleted: %s; it is left there", generation.path, said(error))
+                log.warning("%s cannot be deleted: %s; the file remains", generation.path, said(error))
         sync_folder(self.folder)
 
     def close(self) -> None:

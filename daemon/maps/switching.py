@@ -30,11 +30,11 @@ log = logging.getLogger(__name__)
 
 NOTHING_TO_SAVE: Final = (DONE, NO_MAP, FIXED, ADRIFT)
 
-BUSY: Final = "another map is just being loaded"
+BUSY: Final = "another map is being loaded"
 IN_USE: Final = "that map is in use"
-NO_FOLDER: Final = "maps are not kept: `map.folder` is none"
+NO_FOLDER: Final = "maps are not stored, because `map.folder` is none"
 NOT_LOADED: Final = "the estimator is still being loaded"
-NOTHING_COMES: Final = "nothing arrives from lidar, odometry or photodiode, so no cycle can take the map over"
+NOTHING_COMES: Final = "no data arrive from lidar, odometry or photodiode, so no cycle can load the map"
 TAKEN_S: Final = 10.0
 """Time limit in s: a cycle with records adopts the map within a scan; without one the switch is abandoned."""
 
@@ -125,7 +125,7 @@ class MapSwitch:
         try:
             reason = await self._carried_out(map_id, patient)
         except Exception as error:  # a defect must not leave the client waiting, and is logged in full
-            log.exception("the map cannot be switched")
+            log.exception("switching the map has failed")
             reason = repr(error)
         on_done(reason)
 
@@ -143,7 +143,7 @@ class MapSwitch:
             return f"{store.folder}: {said(error)}"
         if map_id not in there:
             named = ", ".join(f"{one:08x}" for one in sorted(there)) or "none"
-            return f"there is no map {map_id:08x} in {store.folder}; there are: {named}"
+            return f"no map {map_id:08x} in {store.folder}; available maps: {named}"
         if (reason := await self._saved()) not in NOTHING_TO_SAVE:
             return f"the map in use cannot be saved: {reason}"
         try:
@@ -159,7 +159,7 @@ class MapSwitch:
             if not taken.is_set():
                 self._put(None, taken.set)
                 return NOTHING_COMES
-        log.info("map %08x is in use; the robot is looked for in it", map_id)
+        log.info("map %08x is in use; the daemon searches for the pose in it", map_id)
         return DONE
 
     async def _saved(self) -> str:

@@ -144,7 +144,9 @@ class MapTiles:
                 done = progress, {tile: _packed(cells) for tile, cells in progress.tiles.items()}
             except Exception:  # drawing must not affect localisation; the defect is logged in full, once
                 if not self.error:
-                    log.exception("the map cannot be drawn for the stream; it is tried again every %.0f s", AGAIN_S)
+                    log.exception(
+                        "the map cannot be drawn for the stream; the daemon tries again every %.0f s", AGAIN_S
+                    )
             try:
                 loop.call_soon_threadsafe(self._take, live, done, adrift, left, loop)
             except RuntimeError:
@@ -166,7 +168,7 @@ class MapTiles:
             return  # it was closed meanwhile
         self._busy = False
         if done is None:
-            self.error, self._again = "it cannot be drawn, see the log", loop.time() + AGAIN_S
+            self.error, self._again = "the map cannot be drawn; read the log", loop.time() + AGAIN_S
             return
         self.error = ""
         progress, packed = done

@@ -46,7 +46,7 @@ class Access:
         self.refused += 1
         if host not in self._told and len(self._told) < TOLD:
             self._told.add(host)
-            log.warning("%s is not answered: it is not in `allow`", host)
+            log.warning("%s gets no reply, because it is not in `allow`", host)
         return False
 
     def _look(self, host: str) -> bool:

@@ -54,21 +54,21 @@ def request_of(line: bytes) -> Request:
     try:
         asked = _decode(line)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise BadRequest(f"no request: {error}") from None
+        raise BadRequest(f"invalid request: {error}") from None
     code = next((code for code in CommandCode if code.name.lower() == asked.command), None)
     if code is None:
         names = ", ".join(code.name.lower() for code in CommandCode)
-        raise BadRequest(f"no command {asked.command[:40]!r}; there are {names}")
+        raise BadRequest(f"unknown command {asked.command[:40]!r}; available: {names}")
     pose = asked.x_m, asked.y_m, asked.yaw_rad
     if (code is CommandCode.SET_POSE) != (None not in pose) or pose.count(None) % 3:
-        raise BadRequest("x_m, y_m and yaw_rad belong to set_pose, and only to it")
+        raise BadRequest("x_m, y_m and yaw_rad are needed for set_pose, and allowed only there")
     if (code is CommandCode.SWITCH_MAP) != (asked.map_id is not None):
-        raise BadRequest("map_id belongs to switch_map, and only to it")
+        raise BadRequest("map_id is needed for switch_map, and allowed only there")
     x, y, yaw = (value or 0.0 for value in pose)
     if not max(abs(x), abs(y)) <= FARTHEST_M or not abs(yaw) <= FARTHEST_M:
-        raise BadRequest(f"a pose beyond {FARTHEST_M:.0f} m or rad")
+        raise BadRequest(f"the pose is beyond {FARTHEST_M:.0f} m or rad")
     if not 0 <= (map_id := asked.map_id or 0) < MAP_IDS:
-        raise BadRequest("map_id: an unsigned number of 32 bits")
+        raise BadRequest("map_id must be an unsigned number of 32 bits")
     return Request(0, code, (x, y, math.remainder(yaw, 2.0 * math.pi)), map_id)
 
 

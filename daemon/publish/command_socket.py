@@ -75,7 +75,7 @@ class CommandSocket:
         """Accept a connection; the oldest one makes room for it."""
         if len(self.clients) >= CLIENTS:
             oldest = next(iter(self.clients))
-            oldest.answer(Outcome.RUNNING, "a newer client has taken this connection's place")
+            oldest.answer(Outcome.RUNNING, "a newer client has replaced this connection")
             self.clients.pop(oldest, None)
         self.clients[client] = None
 
@@ -97,7 +97,7 @@ class Client(asyncio.Protocol):
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         self._server.admit(self)
-        self._wait(REQUEST_S, Outcome.REFUSED, f"no request within {REQUEST_S:g} s")
+        self._wait(REQUEST_S, Outcome.REFUSED, f"no request arrived within {REQUEST_S:g} s")
 
     def connection_lost(self, exc: Exception | None) -> None:
         """asyncio: the client has gone, or this side has closed. A command that runs stays in force."""
@@ -120,7 +120,7 @@ class Client(asyncio.Protocol):
         self._received += data
         line, newline, _ = self._received.partition(b"\n")
         if len(line) > LONGEST_REQUEST:
-            self.answer(Outcome.REFUSED, f"a request longer than {LONGEST_REQUEST} bytes")
+            self.answer(Outcome.REFUSED, f"the request is longer than {LONGEST_REQUEST} bytes")
         elif newline:
             self._asked = True
             self._ask()

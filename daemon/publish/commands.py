@@ -26,8 +26,8 @@ from hal.clock import Clock
 log = logging.getLogger(__name__)
 
 
-NO_RECORDER: Final = "this run keeps no flight recorder: start it with --record DIR --last MINUTES"
-NO_MAPS: Final = "this run stores no maps: set map.folder"
+NO_RECORDER: Final = "the flight recorder is off; start the daemon with --record DIR --last MINUTES"
+NO_MAPS: Final = "maps are not stored; set `map.folder`"
 ASKED: Final = 8
 """Largest number of pending requests of one source, the latest ones: Modbus acknowledges only the last one."""
 MODBUS: Final = "Modbus"
@@ -66,7 +66,7 @@ class Orders:
             log.debug(
                 "%s has failed", request.code.name, exc_info=True
             )  # debug only: at a client's rate it would fill the log
-            on_done(f"it has failed: {failure!r}")
+            on_done(f"the command has failed: {failure!r}")
 
     def _hand_on(self, request: Request, on_done: OnDone, on_end: OnEnd, source: str) -> None:
         feeds, code = self._feeds, request.code

@@ -323,7 +323,7 @@ def _limits() -> str:
         ("registers written in one request that reads too", str(requests.MAX_READ_WRITE), "exception 3"),
         ("address outside the tables", "", "exception 2"),
         ("any other function", "", "exception 1"),
-        ("an error of the daemon's own, which its log tells", "", "exception 4"),
+        ("an internal error, which is in the log", "", "exception 4"),
         ("TCP connections", str(counts.MAX_CONNECTIONS),
          f"the longest idle is dropped if idle for {tcp_endpoint.EVICT_S:g} s, else one of the host with the most, if "
          "that has more than the new one's, else the new one"),
@@ -333,7 +333,7 @@ def _limits() -> str:
         ("TCP without a request", f"{tcp_endpoint.IDLE_S:g} s", "closed"),
         ("TCP request not completed", f"{tcp_endpoint.PARTIAL_S:g} s", "closed"),
         ("TCP answers not read", f"{tcp_endpoint.STUCK_S:g} s", "closed"),
-        ("what is not Modbus", "", "UDP: ignored; TCP: closed; the log names who sends it, once a minute"),
+        ("data that is not Modbus", "", "UDP: ignored; TCP: closed; the log names the sender once a minute"),
     ]  # fmt: skip
     return table(("what", "limit", "beyond it"), rows)
 

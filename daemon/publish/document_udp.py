@@ -98,10 +98,10 @@ than its request. Addresses that are not in `allow` get none.
 
 
 _STATUSES: Final[dict[udp_subscriptions.Status, str]] = {
-    udp_subscriptions.Status.ASK: "client: send me pose datagrams for `lease` seconds; 0: no more",
+    udp_subscriptions.Status.ASK: "client: send pose datagrams for `lease` seconds; 0: stop",
     udp_subscriptions.Status.COOKIE: "daemon: ask again with this cookie",
-    udp_subscriptions.Status.GRANTED: "daemon: for `lease` seconds from now",
-    udp_subscriptions.Status.FULL: "daemon: there are as many subscribers as can be; try later",
+    udp_subscriptions.Status.GRANTED: "daemon: subscribed for `lease` seconds from now",
+    udp_subscriptions.Status.FULL: "daemon: the number of subscribers is at its limit; try later",
     udp_subscriptions.Status.ENDED: "daemon: no more are sent",
 }
 

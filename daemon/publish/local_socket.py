@@ -33,7 +33,7 @@ def _bound(what: str, path: Path, mode: int, backlog: int) -> socket.socket:
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_socket():
         if _alive(path):
-            raise DeviceRefused(f"{what} {path}", "another program serves it", "stop that one")
+            raise DeviceRefused(f"{what} {path}", "another program serves it", "stop that program")
         path.unlink()
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:

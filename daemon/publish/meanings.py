@@ -9,7 +9,7 @@ from daemon.snapshot import LightFix, LinkUse, LoopReason, State
 
 STATES: Final[dict[State, str]] = {
     State.STARTING: "starting; there is no pose yet",
-    State.NO_LIDAR: "no valid scan for three scan periods, or scans do not arrive steadily yet",
+    State.NO_LIDAR: "no valid scan for three scan periods, or scans are not steady yet",
     State.MAPPING: "the pose follows the lidar; it is not confirmed yet",
     State.TRACKING: "the pose is known: two solutions agree, or one is confirmed",
     State.DEGRADED: "the pose is known, but an axis or a solution is missing",
@@ -46,19 +46,19 @@ LOOPS: Final[dict[LoopReason, str]] = {
     LoopReason.PLACED: "relocalisation: the only pose in the map that fits everything since the pose was lost",
 }
 COMMANDS: Final[dict[CommandCode, str]] = {
-    CommandCode.SET_POSE: "Sets the pose to `x`, `y`, `yaw` in the map. Done once the daemon has taken it; the state "
-    "shows whether it is right. In a stored map the daemon searches within 1 m and 0.5 rad of it (RELOCATING). If four "
-    "attempts on the way find nothing there, it searches the whole map. In a map of this run the pose is set as given, "
-    "and the map moves with it. Lamps can contradict it later.",
+    CommandCode.SET_POSE: "Sets the pose to `x`, `y`, `yaw` in the map. Done when the daemon has accepted it; "
+    "the state shows whether it is right. In a stored map the daemon searches within 1 m and 0.5 rad of it "
+    "(RELOCATING). After four attempts without a match it searches the whole map. In a map of this run the "
+    "pose is set as given, and the map moves with it. Later light can contradict it.",
     CommandCode.RESET: "Forgets map and pose, and begins a new map. Stored maps remain.",
-    CommandCode.SAVE_MAP: "Writes the map to the disk. Done when it is there and has been read back.",
+    CommandCode.SAVE_MAP: "Writes the map to the disk. Done when it has been read back.",
     CommandCode.RELOCALISE: "Searches for the pose in the whole map, as after a kidnapping.",
-    CommandCode.PAUSE: "Stops mapping, and stops corrections of the pose by the lidar. Light and odometry continue. "
-    "The state is DEGRADED, and LOST once nothing determines the pose any more, both with reason 20. Use it in a hall "
-    "full of people, or on a lift. If the robot moves with neither light nor odometry, send SET_POSE or RELOCALISE "
-    "afterwards.",
+    CommandCode.PAUSE: "Stops mapping, and stops corrections of the pose by the lidar. Light and odometry "
+    "continue. The state is DEGRADED, and LOST once nothing determines the pose any more, both with reason "
+    "20. Use it in a crowded hall or on a lift. If the robot moves with neither light nor odometry, send "
+    "SET_POSE or RELOCALISE afterwards.",
     CommandCode.RESUME: "Ends a pause.",
-    CommandCode.DUMP_RECORDER: "Writes the content of the flight recorder to the disk. Done when it is there.",
+    CommandCode.DUMP_RECORDER: "Writes the content of the flight recorder to the disk. Done when the dump is complete.",
     CommandCode.SWITCH_MAP: "Saves the map in use, loads the stored map `map_id`, and searches for the pose in it. "
     "Done when the map is in use. Refused if there is no such map; then nothing changes.",
 }

@@ -54,7 +54,7 @@ class OneSender:
         if sender != self._sender and self._sender and reading.t_rx - self._heard <= ODOMETRY_SILENT_S:
             self.refused += 1
             if reading.t_rx - self._refused_at > CALM_S:
-                log.warning("odometry from %s is ignored while %s sends it too", sender, self._sender)
+                log.warning("odometry from %s is ignored while %s sends odometry too", sender, self._sender)
             self._refused_at = reading.t_rx
             return
         self._sender, self._heard = sender, reading.t_rx

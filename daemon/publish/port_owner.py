@@ -44,7 +44,7 @@ class Whose:
     def __str__(self) -> str:
         if not self.pid:
             return ""
-        passed_on = f" (the configured name is that of process {self.meant}, which has a network of its own)"
+        passed_on = f" (the configured name belongs to process {self.meant} in another network namespace)"
         said = f"process {self.pid}" + (f": {self.command}" if self.command else "")
         return said + (passed_on if self.apart and self.pid != self.meant else "")
 

@@ -150,7 +150,9 @@ class PoseSender:
         """Log the loss of a receiver once; the heartbeat gives the warning, with the fault's number."""
         if receiver.reachable:
             receiver.reachable = False
-            log.info("pose receiver %s: %s; datagrams to it are dropped until it is back", receiver.name, problem)
+            log.info(
+                "pose receiver %s: %s; datagrams to it are dropped until it can be reached", receiver.name, problem
+            )
 
     async def _look_up(self, receiver: Receiver) -> None:
         while True:
@@ -162,6 +164,6 @@ class PoseSender:
                     self._lost(receiver, error.problem)
                 pause = RETRY_S
             except Exception:  # such as no thread left: the receiver is tried again later
-                log.exception("pose receiver %s cannot be looked up; it is tried again", receiver.name)
+                log.exception("the name of pose receiver %s cannot be resolved; the daemon tries again", receiver.name)
                 pause = RETRY_S
             await asyncio.sleep(pause)

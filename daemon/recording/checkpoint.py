@@ -157,7 +157,7 @@ def capture(state: State, rest: dict[str, object]) -> Taken:
     try:
         taken.seal({"state": state, "rest": rest})
     except (TypeError, AttributeError, ValueError, pickle.PicklingError, RecursionError) as error:
-        raise CannotTake(f"the state cannot be taken: {error}") from error
+        raise CannotTake(f"the checkpoint cannot be made: {error}") from error
     return taken
 
 
@@ -294,7 +294,7 @@ class _Describer:
             return one  # type: ignore[no-any-return]  # of one of these types
         if kind is int:
             if not _LEAST <= one < _MOST:
-                raise CannotTake(f"the number {one} is too large for a state")
+                raise CannotTake(f"the number {one} is too large for a checkpoint")
             return one  # type: ignore[no-any-return]
         number = self._numbers.get(id(one))
         if number is None:
@@ -332,7 +332,7 @@ class _Describer:
         if isinstance(one, (dict, list, set, frozenset, deque, str, bytes, int, float, type)) or (
             isinstance(one, tuple) and not is_named_tuple(kind)
         ):
-            raise CannotTake(f"{kind.__module__}.{kind.__qualname__} belongs into no state")
+            raise CannotTake(f"{kind.__module__}.{kind.__qualname__} cannot be part of a checkpoint")
         names = fields_of(kind)
         if kind is Submap:
             said = self._of_submap(one)
@@ -347,7 +347,7 @@ class _Describer:
     def _of_submap(self, submap: Submap) -> dict[str, Any]:
         values = self._submaps.get(id(submap))
         if values is None:
-            raise CannotTake(f"submap {submap.key} was not there when the state was taken")
+            raise CannotTake(f"submap {submap.key} was missing when the checkpoint was made")
         return {**dict(zip(_SUBMAP, values, strict=True)), "hung": _Weak(values[-1])}
 
     def _kind(self, kind: type, names: tuple[str, ...]) -> int:
@@ -372,6 +372,6 @@ def attributes(one: object) -> dict[str, Any]:
 def _array(one: Any) -> Array:
     dtype = one.dtype
     if dtype.kind not in PLAIN or dtype.names is not None:
-        raise CannotTake(f"arrays of {dtype} belong into no state")
+        raise CannotTake(f"arrays of {dtype} cannot be part of a checkpoint")
     order = "F" if one.flags.f_contiguous and not one.flags.c_contiguous else "C"
     return Array(dtype.str, one.shape, order, one.tobytes(order), isinstance(one, np.generic))

@@ -194,7 +194,7 @@ class SegmentWriter:
             os.fdatasync(self._file)
             self._synced_at, self._dirty = time.monotonic(), False
         if self.error:
-            log.warning("recording goes on in %s; %d records were lost", self.folder, self.lost)
+            log.warning("recording continues in %s; %d records were lost", self.folder, self.lost)
             self.error = ""
 
     def _clock_was_set(self) -> bool:
@@ -217,7 +217,7 @@ class SegmentWriter:
     def _fail(self, error: Exception, batches: list[Batch]) -> None:
         reason = reason_of(error)
         if not self.error:
-            line = "recording into %s has stopped: %s; it goes on when it can be written again"
+            line = "recording to %s has stopped: %s; it continues when the folder can be written again"
             log.error(line, self.folder, reason, exc_info=defect_in(error))
         self.error = f"{self.folder}: {reason}"
         self._lose(batches)

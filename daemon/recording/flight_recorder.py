@@ -51,7 +51,7 @@ JOBS: Final = 64
 """Number of pending jobs above which jobs without a recipient are removed."""
 UNASKED: Final = 16
 """Jobs kept although the estimator waits for them no longer; they may still give a result."""
-UNDER_WAY: Final = "another dump is just being made"
+UNDER_WAY: Final = "another dump is being written"
 QUIET: Final = frozenset((Fault.RECORDER_FAILED, Fault.FLIGHT_RECORDER_FAILED))
 """Faults on which a dump has no information."""
 
@@ -192,7 +192,7 @@ class BlackBox:
             on_done(UNDER_WAY)
             return
         if now < self._ask_from:
-            on_done(f"one was made a moment ago; another can be made in {self._ask_from - now:.0f} s")
+            on_done(f"the last dump is too recent; another is possible in {self._ask_from - now:.0f} s")
             return
 
         def end(reason: str) -> None:
@@ -205,7 +205,7 @@ class BlackBox:
 
         self._asked, self._ask_from = True, now + ASKED_AGAIN_S
         try:
-            self._dump(ASKED, "somebody has asked for it", back)
+            self._dump(ASKED, "a client has requested it", back)
         except Exception as error:  # a defect here must not leave the client waiting; it is logged in full
             log.exception("the flight recorder has failed")
             end(repr(error))
@@ -290,7 +290,7 @@ class BlackBox:
             taken = capture(state, rest)
         except CannotTake as error:
             if not self.error:
-                log.error("flight recorder: %s; what is recorded replays from an older state", error)
+                log.error("flight recorder: %s; the recording replays from an older checkpoint", error)
             self.error = str(error)
             return None
         self.take_s = time.perf_counter() - begun
@@ -314,7 +314,7 @@ class BlackBox:
 
         def then(segment: int | None) -> None:
             if segment is None:
-                on_done("nothing can be written at the moment")
+                on_done("the recorder cannot write at present")
             else:
                 self.flight.dump(about, on_done)
 

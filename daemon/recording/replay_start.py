@@ -56,7 +56,7 @@ class Moment:
         except (CannotRestore, BadState, ValueError) as error:
             made = ", ".join(f"{name} {number}" for name, number in sorted(self.versions.items()))
             raise DataInvalid(
-                str(self.path), f"the state cannot be restored: {error}", f"replay it with {made}"
+                str(self.path), f"the checkpoint cannot be restored: {error}", f"replay it with {made}"
             ) from error
         return Restored(state, rest["jobs"], rest)
 
@@ -71,7 +71,7 @@ def _check(rest: dict[str, Any]) -> None:
     if not all(type(part) is dict for part in parts) or not isinstance(rest["cycle"].get("cycles"), int):
         raise ValueError("a cycle or its jobs are missing")
     if unknown := set(rest["cycle"]) - set(CYCLE_PARTS):
-        raise ValueError(f"a cycle remembers no {', '.join(sorted(map(str, unknown)))}")
+        raise ValueError(f"a cycle has no {', '.join(sorted(map(str, unknown)))}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -78,7 +78,7 @@ def restore(nodes: Iterable[Node]) -> tuple[State, dict[str, Any]]:
         everything = build(nodes)
         state, rest = cast(Any, everything)["state"], cast(Any, everything)["rest"]
         if type(state) is not State or type(rest) is not dict:
-            raise ValueError("it holds no state")
+            raise ValueError("it holds no checkpoint")
         for place, keys in state.map.places.items():
             state.map.places[place] = list(keys)
     except _REFUSED as error:
@@ -159,10 +159,10 @@ class _Builder:
         if type(value) is not Ref:
             return value
         if not 0 <= value.node < len(self._made):
-            raise ValueError(f"there is no node {value.node}")
+            raise ValueError(f"node {value.node} does not exist")
         made = self._made[value.node]
         if made is _NOT_THERE or isinstance(made, _Shape):
-            raise ValueError(f"node {value.node} is no value")
+            raise ValueError(f"node {value.node} is not a value")
         return made
 
     def _values(self, values: Iterable[Value]) -> list[Any]:
@@ -173,7 +173,7 @@ class _Builder:
         if self._made[number] is not _NOT_THERE:
             return
         if depth > DEEPEST:
-            raise ValueError(f"tuples in one another, more than {DEEPEST}")
+            raise ValueError(f"tuples are nested deeper than {DEEPEST}")
         node = self._nodes[number]
         if isinstance(node, Many):
             parts = node.items
@@ -255,7 +255,7 @@ def _blank(kind: type) -> object:
 
 def _container(node: Many) -> object:
     if node.form not in _FORMS:
-        raise ValueError(f"{node.form!r} is no container")
+        raise ValueError(f"{node.form!r} is not a container")
     if node.form in ("tuple", "frozenset"):
         return _NOT_THERE
     made: dict[str, Callable[[], object]] = {"list": list, "set": set, "weakset": WeakSet}
@@ -272,7 +272,7 @@ def _member(node: Member) -> object:
 def _array(node: Array) -> object:
     dtype = np.dtype(node.dtype)
     if dtype.kind not in PLAIN or not dtype.itemsize or dtype.names is not None or dtype.subdtype is not None:
-        raise ValueError(f"arrays of {node.dtype!r} belong into no state")
+        raise ValueError(f"arrays of {node.dtype!r} cannot be part of a checkpoint")
     if any(size < 0 for size in node.shape) or node.order not in ("C", "F"):
         raise ValueError(f"no array has the shape {node.shape}")
     if prod(node.shape) * dtype.itemsize != len(node.data) or (node.scalar and node.shape):

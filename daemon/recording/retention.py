@@ -144,7 +144,7 @@ class Flight:
         self._tasks.put(None)
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():  # it still writes: the ring stays locked until it has finished
-            log.warning("%s: not everything is written yet; the next start keeps it as a dump", self._folder)
+            log.warning("%s: the recording is not completely written; the next start keeps it as a dump", self._folder)
             return
         if self._ring >= 0:
             if ended and not self._owed:
@@ -161,8 +161,8 @@ class Flight:
                 self._mark_ring()
                 task()
             except Exception:  # a defect here must not end the recording; it is logged in full
-                log.exception("the recording's folder cannot be looked after")
-                self.error = "a defect, see the log"
+                log.exception("the folder of the recording cannot be managed")
+                self.error = "an internal error, read the log"
 
     def _keep(self, begun: Begun) -> None:
         """Writes a checkpoint and removes what is too old."""
@@ -192,7 +192,7 @@ class Flight:
         said = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
         if not self.error:
             log.error(
-                "%s cannot be kept in %s: %s; what is recorded then replays from an older one", what, self._folder, said
+                "%s cannot be stored in %s: %s; the recording replays from an older one", what, self._folder, said
             )
         self.error = f"{what}: {said}"
 
@@ -227,8 +227,8 @@ class Flight:
         except OSError:
             return 0
         if room < RESERVE_BYTES and not self._said_full:
-            what = "the oldest dumps go from now on, and then the oldest part of the recording"
-            log.warning("%s has %d MB of room left: %s", self._folder, room >> 20, what)
+            what = "the oldest dumps and then the oldest segments are removed from now on"
+            log.warning("%s has %d MB of free space: %s", self._folder, room >> 20, what)
             self._said_full = True
         return RESERVE_BYTES - room
 
@@ -240,7 +240,7 @@ class Flight:
                 held = _held_alone(dump)
                 shutil.rmtree(dump)
                 lacking -= held
-                log.warning("%s was taken away, for there is too little room on the disk", dump)
+                log.warning("%s was removed, because the disk has too little free space", dump)
                 if lacking <= 0:
                     break
         return lacking > 0
@@ -260,7 +260,7 @@ class Flight:
                     path.unlink()
 
     def _dump(self, about: dict[str, Any], on_done: OnDone) -> None:
-        reason = "a defect, see the log"
+        reason = "an internal error, read the log"
         try:
             reason = self._dumped(about)
         finally:  # the client gets a result in every case
@@ -392,8 +392,8 @@ def _see_to(mark: Path) -> Path | None:
             mark.parent.rename(kept)
         (kept / RING).unlink()
         sync_folder(kept.parent)
-        log.warning("a run did not end as it should, or one of its dumps is missing: what it recorded is in %s", kept)
+        log.warning("the last run ended abnormally, or one of its dumps is missing; its recording is in %s", kept)
         _prune_dumps(kept.parent, kept)
     except OSError as error:
-        log.warning("%s: the ring of an earlier run stays as it is: %s", mark.parent, error.strerror)
+        log.warning("%s: the ring of an earlier run cannot be made a dump: %s", mark.parent, error.strerror)
     return kept

@@ -38,7 +38,7 @@ _decode: Final = msgspec.msgpack.Decoder(list[Node | End]).decode
 class BadState(Exception):
     """A state file that cannot be used; the text says what is wrong with it, ``remedy`` what to do."""
 
-    remedy = "take the segments from the next state on"
+    remedy = "use the segments from the next checkpoint on"
 
 
 class OtherVersion(BadState):

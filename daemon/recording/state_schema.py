@@ -152,7 +152,7 @@ def name_of(what: type | FunctionType) -> str:
     group = _group(what.__module__)
     name = f"{group}.{what.__qualname__}"
     if group is None or "." in what.__qualname__ or (isinstance(what, FunctionType) and not _is_stored(what)):
-        raise UnknownName(f"{what.__module__}.{what.__qualname__} belongs into no state")
+        raise UnknownName(f"{what.__module__}.{what.__qualname__} cannot be part of a checkpoint")
     return name
 
 
@@ -160,7 +160,7 @@ def class_of(name: str) -> type:
     """Returns the class of a name; raises `UnknownName`."""
     found = _member(name)
     if not isinstance(found, type):
-        raise UnknownName(f"{name!r} is no class of a state")
+        raise UnknownName(f"{name!r} is not a class of the checkpoint")
     return found
 
 
@@ -168,7 +168,7 @@ def function_of(name: str) -> Callable[..., Any]:
     """Returns the function of a name: one that jobs consist of, or the scan matcher; raises `UnknownName`."""
     found = _member(name)
     if not isinstance(found, FunctionType) or not _is_stored(found):
-        raise UnknownName(f"{name!r} is no function of a state")
+        raise UnknownName(f"{name!r} is not a function of the checkpoint")
     return found
 
 
@@ -214,7 +214,7 @@ def _is_stored(function: FunctionType) -> bool:
 def _member(name: str) -> object:
     group, _, own = name.partition(".")
     if group not in MODULES and group not in PACKAGES:
-        raise UnknownName(f"{name!r} belongs into no state")
+        raise UnknownName(f"{name!r} cannot be part of a checkpoint")
     return members(group).get(own)
 
 

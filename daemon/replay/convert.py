@@ -136,7 +136,7 @@ def _rows(path: Path, report: LogReport) -> Array:
     except HalError as error:
         raise NotConverted(str(error)) from error
     if torn.reason:
-        report.notes.append(f"{torn.reason}; what was read is used")
+        report.notes.append(f"{torn.reason}; the part before it is used")
     if not rows:
         first = next(((entry.first[0], reason) for reason, entry in report.skipped.items()), None)
         raise NotConverted(f"{path}: {torn.reason}" if first is None else f"{path}:{first[0]}: {first[1]}")
@@ -161,10 +161,10 @@ def _timed(path: Path, stamps: Array, report: LogReport) -> Array:
     """
     clock = monotone(stamps, float(stamps[0]))
     if clock.refusal:
-        raise NotConverted(f"{path}: its stamps give no time: {clock.refusal}")
+        raise NotConverted(f"{path}: its stamps cannot be used as times: {clock.refusal}")
     if np.all(np.diff(stamps) > 0.0) and not clock.restarts:
         return stamps
-    report.notes.append("stamps run back or repeat: the clock's changes are bridged, equal stamps spread")
+    report.notes.append("stamps run backwards or repeat; clock steps are removed, and equal stamps are spread in time")
     return np.asarray(stamps[0] + clock.time)
 
 

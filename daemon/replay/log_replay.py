@@ -82,7 +82,7 @@ def _load_method(source: Source, given: Given, method: str) -> None:
     """Loads the kernels of another method than the daemon's, and notes that it begins without a stored map."""
     warmup.load_aloud(console.say, "warm-methods", warmup.load, "estimator.paper.methods")
     if source.begin is not None or MAP in source.header or any(key.startswith("map.") for key in given.keys):
-        source.report.notes.append(f"method {method} begins with an empty map: a stored map or state is not used")
+        source.report.notes.append(f"method {method} begins with an empty map; a stored map or checkpoint is not used")
 
 
 def _play(rerun: Rerun, source: Source) -> None:

@@ -80,13 +80,15 @@ def choice_of(words: str | None, seconds: float | None) -> Choice:
         BadChoice: not a list of numbers from 1, nor ``failed``; or more than :data:`MOST`.
     """
     if seconds is not None and not (math.isfinite(seconds) and seconds >= 0.0):
-        raise BadChoice(f"--journal-at {seconds}: give seconds since the beginning of the log")
+        raise BadChoice(f"--journal-at {seconds}: not a time; give seconds since the start of the log")
     parts = [part.strip() for part in words.split(",")] if words is not None else []
     numbers = [part for part in parts if part != FAILED]
     if not all(part.isdecimal() and int(part) > 0 for part in numbers):
-        raise BadChoice(f"--journal {words}: give numbers of matches from 1, separated by commas, or {FAILED}")
+        raise BadChoice(
+            f"--journal {words}: not a list of matches; give numbers from 1, separated by commas, or {FAILED}"
+        )
     if len(numbers) > MOST:
-        raise BadChoice(f"--journal with {len(numbers)} numbers: at most {MOST} in one run")
+        raise BadChoice(f"--journal with {len(numbers)} numbers; at most {MOST} are possible in one run")
     times = () if seconds is None else (seconds,)
     return Choice(frozenset(int(part) for part in numbers), times, FAILED in parts)
 
@@ -214,21 +216,21 @@ class MatchJournal:
         said = [f"matches written: {len(self.kept)}" + self._cleared()]
         missing = sorted(n for n in self.choice.numbers if n > self.matches)
         if missing:
-            said.append(f"no match {', '.join(map(str, missing))}: the log has {self.matches}")
+            said.append(f"no match {', '.join(map(str, missing))}; the log has {self.matches}")
         late = [f"{second:g} s" for second in self.choice.seconds if second > self._before]
         if late:
             said.append(f"no match at or after {', '.join(late)}")
         if self.choice.failed:
-            said.append(f"{self.failed} matches were no result" + self._beyond())
+            said.append(f"{self.failed} matches failed" + self._beyond())
         if self.kept and not match_plot.available():
-            said.append(f"no pictures of matches: matplotlib is not installed ({how_to_install('plot')})")
+            said.append(f"no plots of matches: matplotlib is not installed ({how_to_install('plot')})")
         return said
 
     def _cleared(self) -> str:
         return f"; files of an earlier run removed: {self.removed}" if self.removed else ""
 
     def _beyond(self) -> str:
-        return f"; the first {MOST_FAILED} of them are in the journal" if self.failed > MOST_FAILED else ""
+        return f"; the first {MOST_FAILED} of them are in the match trace" if self.failed > MOST_FAILED else ""
 
 
 def document(name: Named, entry: Entry, told: tuple[Told, ...]) -> dict[str, Any]:

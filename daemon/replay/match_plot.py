@@ -45,12 +45,12 @@ def draw(name: str, entry: Entry, told: tuple[Told, ...]) -> bytes | None:
 
 
 def _title(name: str, entry: Entry, told: tuple[Told, ...]) -> str:
-    result, second = entry.result, ", with a second opinion" if len(told) > 1 else ""
+    result, second = entry.result, ", with multi-start" if len(told) > 1 else ""
     x, y, yaw = result.correction.tolist()
     off, turn = np.hypot(x, y), f"{np.degrees(yaw):.2f} deg"
     moved = f"prediction corrected by {1e3 * off:.1f} mm, {turn}"
     if result.reason is Reason.REJECTED:
-        moved = f"would have moved the prediction by {off:.2f} m, {turn}; refused"
+        moved = f"would have moved the prediction by {off:.2f} m, {turn}; rejected"
     fit = f"{result.inliers} of {result.queries} points fit, residual {1e3 * result.residual_m:.1f} mm"
     line = f"{result.iterations} iterations{second}; {moved}; {fit}" if told else f"{result.queries} points"
     return f"{name}: {result.reason.value}\n{line}"
@@ -82,7 +82,7 @@ def _pairs(axes: Any, what: tuple[Entry, Told], number: int, most: float) -> Any
     elements = entry.asked[1].elements
     axes.plot(elements[:, local_map.X], elements[:, local_map.Y], "s", color="0.8", markersize=2, label="local map")
     if not told.iterations:
-        axes.set(title="no iteration was allowed", aspect="equal")
+        axes.set(title="the iteration limit was 0", aspect="equal")
         return None
     one, points = told.iterations[number], told.attempt.view.points[:, :2]
     at = se2.apply(one.T_odom_base, points)

@@ -41,7 +41,9 @@ def config_for(source: Source, config: Config, given: Given) -> Config:
         try:
             return msgspec.convert(_laid_over(tree, msgspec.to_builtins(config), given.keys), Config)
         except msgspec.ValidationError as error:
-            source.report.notes.append(f"the recording's configuration is not of this version ({error}): not used")
+            source.report.notes.append(
+                f"the configuration of the recording is of another version and is not used ({error})"
+            )
     asked = any(key.startswith("lidar.mount") for key in given.keys) or config.lidar.mount != Mount()
     if source.mount is None or asked:
         return config
@@ -82,27 +84,25 @@ def start_for(source: Source, used: Config, lights: Lights | None, given: Given)
         if named or any(key.startswith("map.") for key in given.keys):
             store, start = started(used.map, lights, mend=False)
             if store is not None and start is None:
-                lacks = f"{store.folder} holds no map that can be used"
+                lacks = f"{store.folder} holds no usable map"
                 if "map.folder" in given.keys:
                     raise DataInvalid(str(source.path), lacks, "name another folder, or --set map.folder=none")
-                source.report.notes.append(f"{lacks}: replayed without one")
+                source.report.notes.append(f"{lacks}; the replay runs without one")
             return start
         if not source.recorded or MAP not in source.header:
             return None
         path, sha256 = source.files[0].parent / START, source.header[MAP]["sha256"]
         return recorded_start(path, sha256, lights, used.map.localise)
     except (NoMap, BadMap, OSError) as error:
-        remedy = "replay the recording with the files that it was written with, or name a map with --set map.folder=DIR"
-        raise DataInvalid(str(source.path), f"the map it began with cannot be used: {error}", remedy) from error
+        remedy = "replay the recording with its original files, or name a map with --set map.folder=DIR"
+        raise DataInvalid(str(source.path), f"its initial map cannot be used: {error}", remedy) from error
 
 
 def _recorded_lights(source: Source) -> Lights | None:
     folder = source.files[0].parent
     lights = from_header(source.header, folder)
     if lights is not None and lost_residuals(source.header, lights):
-        source.report.notes.append(
-            f"the residual map it was made with is not in {folder} any more, or damaged: replayed without it"
-        )
+        source.report.notes.append(f"its residual map is missing in {folder} or damaged; the replay runs without it")
     return lights
 
 

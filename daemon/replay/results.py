@@ -79,7 +79,7 @@ class Folder:
         except FileExistsError as error:
             raise OutputRefused(f"{path} is a file; name a folder for the results") from error
         except OSError as error:
-            raise OutputRefused(f"cannot make {path}: {error.strerror}; name a folder that you may write") from error
+            raise OutputRefused(f"cannot create {path}: {error.strerror}; name a folder with write access") from error
         try:
             (path / _PROBE).write_bytes(b"may be written")
             (path / _PROBE).unlink()
@@ -138,7 +138,7 @@ class Folder:
         if refused:
             others = ", ".join(name for name, _ in refused[1:])
             first = refused[0][1]
-            raise OutputRefused(f"{first}; nor could {others} be written" if others else str(first)) from first
+            raise OutputRefused(f"{first}; {others} could not be written either" if others else str(first)) from first
 
 
 def tum(trajectory: Trajectory) -> bytes:
@@ -166,7 +166,7 @@ def guessed(told: Trajectory) -> str:
         return ""
     named = ", ".join(f"{state} {count}" for state, count in states.most_common())
     last = f"; the last one too ({guesses[-1]})" if guesses[-1] else ""
-    return f"{states.total()} of {len(guesses)} poses are guesses, their place was not known ({named}){last}"
+    return f"{states.total()} of {len(guesses)} poses are unconfirmed ({named}){last}"
 
 
 def doubt(told: Trajectory) -> str:
@@ -174,7 +174,7 @@ def doubt(told: Trajectory) -> str:
     share = sum(map(bool, told.guesses())) / max(1, len(told.stamps))
     if share <= DOUBTFUL:
         return ""
-    return f"{100.0 * share:.0f} % of the poses are guesses: do not rely on this trajectory, nor on its map"
+    return f"{100.0 * share:.0f} % of the poses are unconfirmed; do not use this trajectory or its map"
 
 
 def kitti(trajectory: Trajectory) -> bytes:

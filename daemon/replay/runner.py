@@ -295,7 +295,7 @@ class Rerun:
         try:
             start = recorded_start(path, sha256, self._lights, self._localise)
         except (OSError, BadMap) as error:
-            raise LookupError(f"{path.name}, the map that the run went on in, cannot be used: {error}") from error
+            raise LookupError(f"{path.name}, the map to which the run switched, cannot be used: {error}") from error
         self.ledger.settle(estimator.keyframe_poses(self._state))
         take_over(
             self._state, new_state(self._lights, estimator.Settings(history=True, localise=self._localise), start)
@@ -313,15 +313,15 @@ class Rerun:
             self.comparison.judged += 1
             self.comparison.faults.update(entry.faults)
         if (entry.scan, entry.dropped) != (record.scan, record.dropped):
-            self.comparison.note(entry.cycle, f"took scan {record.scan}, recorded is {entry.scan}")
+            self.comparison.note(entry.cycle, f"used scan {record.scan}, recorded is {entry.scan}")
         elif entry.samples != record.samples:
-            self.comparison.note(entry.cycle, f"took block {record.samples}, recorded is {entry.samples}")
+            self.comparison.note(entry.cycle, f"used block {record.samples}, recorded is {entry.samples}")
         elif entry.caps() != record.limits:
-            self.comparison.note(entry.cycle, "stepped where the recorded cycle did not, or the other way round")
+            self.comparison.note(entry.cycle, "made an estimator step and the recorded cycle did not, or the reverse")
         elif pose != recorded:
             self.comparison.note(entry.cycle, f"T_odom_base, T_map_odom are {pose}, recorded are {recorded}")
         elif light != entry.light:
-            self.comparison.note(entry.cycle, f"the pose from light is {light}, recorded is {entry.light}")
+            self.comparison.note(entry.cycle, f"the light solution is {light}, recorded is {entry.light}")
         elif entry.reason is not None and judged != said:
             self.comparison.note(entry.cycle, f"state and reason are {judged}, recorded are {said}")
 

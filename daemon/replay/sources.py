@@ -124,7 +124,7 @@ def _open(path: Path) -> Source:
         return CaptureSource(path)
     for magic, what in FOREIGN.items():
         if begin.startswith(magic):
-            remedy = "replay or export the recording that it was made of" if "MCAP" in what else _REMEDY
+            remedy = "replay or export the recording from which it was made" if "MCAP" in what else _REMEDY
             raise DataInvalid(str(path), f"is {what}, which cannot be replayed", remedy)
     return CarmenSource(path)
 
@@ -142,7 +142,7 @@ FOREIGN: Final = {
 MOVED_S: Final = 0.005
 """Tolerance between decoded and recorded scan times, s: the passive codec has neither the baud rate nor the driver's
 model of the sensor clock."""
-_REMEDY: Final = "unpack it, or turn it into a CARMEN log with `lumiloop convert IN OUT`"
+_REMEDY: Final = "unpack it, or convert it to a CARMEN log with `lumiloop convert IN OUT`"
 
 
 def sha256_of(source: Source) -> str:
@@ -208,7 +208,7 @@ class CaptureSource(Source):
             yield from self._codec.feed(chunk.data, LEAD_S + latest)
         if self.status.scans == 0:
             self.report.notes.append(
-                "no scan in it: a capture of the host's side, or of a dialogue without measurement"
+                "the capture has no scan: it is of the host's side, or of a dialogue without measurement"
             )
 
     def stamp(self, scan: RawScan) -> float:
@@ -265,7 +265,9 @@ class RecordingSource(Source):
         if state_beside(self._recording.segments[0]).exists() and self._recording.first > 0:
             self.begin = read_moment(state_beside(self._recording.segments[0]))
         if len(self._recording.segments) < len(whole.segments) and until == -math.inf:
-            self.report.notes.append(f"begins with segment {self._recording.first}: what is before has lost its state")
+            self.report.notes.append(
+                f"begins with segment {self._recording.first}; the checkpoints of earlier segments are lost"
+            )
 
     def stamp(self, scan: RawScan) -> float:
         """Returns UTC, s: that of the recording computer at the start, extrapolated by its monotonic clock."""
@@ -295,7 +297,7 @@ class RecordingSource(Source):
         for frame in frames_in(moment.line):
             self._event(frame)
         self._marks = _Marks()
-        self.report.notes.append(f"begins in the middle of a run, with the state after cycle {moment.cycle}")
+        self.report.notes.append(f"begins within a run, with the checkpoint after cycle {moment.cycle}")
 
     def _event(self, frame: Frame) -> Event | None:
         match frame.kind:
@@ -337,8 +339,10 @@ class RecordingSource(Source):
     def _say(self) -> None:
         marks, notes = self._marks, self.report.notes
         if marks.missing:
-            notes.append(f"{marks.missing} scans were delivered when recorded, but their bytes hold no such scan")
+            notes.append(f"{marks.missing} delivered scans are missing in the recorded bytes")
         if marks.unmarked:
-            notes.append(f"{marks.unmarked} scans in the bytes were not delivered when recorded: left out")
+            notes.append(f"{marks.unmarked} scans in the recorded bytes were not delivered then and are skipped")
         if marks.moved:
-            notes.append(f"{marks.moved} scans keep the time of the recorded driver; the bytes alone say another")
+            notes.append(
+                f"{marks.moved} scans keep the time of the recorded driver, which differs from that of the bytes"
+            )

@@ -356,7 +356,7 @@ class Cycle:
                 sink(snapshot)
             except Exception:
                 if number not in self.failing:
-                    log.exception("a publisher has failed; said once until it works again")
+                    log.exception("a publisher has failed; the daemon logs this once until it works again")
                 self.failing.add(number)
             else:
                 self.failing.discard(number)

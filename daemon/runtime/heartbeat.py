@@ -87,7 +87,7 @@ class Heartbeat:
                 self.beat(loop.time() - due)
             except Exception:
                 if not self._failing:
-                    log.exception("a heartbeat has failed; said once until they work again")
+                    log.exception("a periodic task has failed; the daemon logs this once until it works again")
                 self._failing = True
             else:
                 self._failing = False

@@ -115,7 +115,7 @@ class StallWatch:
         if now - self._said_at < AGAIN_S:
             self._unsaid += 1
             return
-        more = f"; {self._unsaid} more since the line before" if self._unsaid else ""
+        more = f"; {self._unsaid} more since the previous line" if self._unsaid else ""
         stolen = self._wait.seconds()
         waited = None if stolen is None or self._kept is None else stolen - self._kept
         self.said = f"no cycle began for {lasted:.3f} s: {cause(caught, lasted, worked, waited)}{more}"
@@ -129,12 +129,12 @@ def cause(caught: Caught, lasted: float, worked: float, waited: float | None) ->
     if worked >= SHARE * lasted:
         return f"{caught.where or 'the loop'}{task} ran for {worked:.3f} s"
     if waited is not None and waited >= SHARE * lasted:
-        return f"other programs had the processor for {waited:.3f} s, in {caught.where or 'the loop'}{task}"
+        return f"other programs used the processor for {waited:.3f} s, in {caught.where or 'the loop'}{task}"
     if caught.others and (caught.where or caught.late >= MUCH_S):
         return f"{caught.where or 'the loop'}{task} waited while {caught.others}"
     if not caught.where and caught.late < MUCH_S:
-        return "nothing was due: neither a scan nor the timer came"
-    return f"{caught.where or 'the loop'}{task} waited: a call that blocks, or the process was stopped"
+        return "no event arrived, neither a scan nor the timer"
+    return f"{caught.where or 'the loop'}{task} waited: a call blocked, or the process was stopped"
 
 
 def place(frame: FrameType | None) -> str:

@@ -49,7 +49,7 @@ MAKE: Final = frozenset({
 """Keys in /proc/cpuinfo of the processor's type, for x86 and for ARM."""
 REPORT_S: Final = 5.0
 """Seconds between two progress lines."""
-EACH: Final = "they cannot be stored, so that each start compiles them"
+EACH: Final = "they cannot be stored, so each start compiles them"
 _one: Final = threading.Lock()
 """Serialises loading within one process."""
 LOOK_S: Final = 0.5
@@ -114,9 +114,9 @@ def load(lights: Lights | None = None) -> Warmth:
     except (MemoryError, ImportError) as error:
         raise CannotLoad(_cause_of(error)) from error
     except PermissionError as error:
-        remedy = "the process must be allowed to make memory executable"  # see MemoryDenyWriteExecute= (systemd.exec)
+        remedy = "allow the process to make memory executable"  # see MemoryDenyWriteExecute= (systemd.exec)
         if error.filename is not None:
-            remedy = "give that file to the user who runs this, or name another folder with NUMBA_CACHE_DIR"
+            remedy = "give this user write access to that file, or name another folder with NUMBA_CACHE_DIR"
         raise CannotLoad(f"kernels cannot be compiled: {error}; {remedy}") from error
     except (OSError, RuntimeError) as error:
         raise CannotLoad(_cause_of(error)) from error
@@ -169,7 +169,7 @@ def _announced(say: Callable[[str], None], before: set[Path]) -> Iterator[None]:
     def look() -> None:
         while not done.wait(LOOK_S):
             if _compiled() - before:
-                say("first start of this version: its kernels are being compiled, which takes a minute or more")
+                say("first start of this version: the daemon compiles its kernels, which takes a minute or more")
                 return
 
     looking = threading.Thread(target=look, name="lumiloop-compiling", daemon=True)
@@ -246,7 +246,7 @@ def _load(begun: float, lights: Lights | None) -> Warmth:
         if cold:
             count = kernel_count(lights is not None)
             log.info(
-                "first start of this version: compiling its %d kernels, or what is missing of them (a minute or two)",
+                "first start of this version: the daemon compiles up to %d kernels (a minute or two)",
                 count,
             )
         before = len(CACHE_REPORT.damaged)
@@ -356,7 +356,7 @@ def _progress_line(seconds: float, lights: bool = False) -> str:
     if directory is None:
         return ""
     if waits.is_set():
-        return f"waiting for another process, which compiles kernels, after {seconds:.0f} s"
+        return f"waiting for another process that compiles kernels, after {seconds:.0f} s"
     since = time.time() - seconds
     try:
         count = sum(path.stat().st_mtime >= since for path in directory.rglob("*.nbc"))

@@ -174,7 +174,9 @@ class ScheduledWorker:
         answers = []
         for job_id in self._schedule.get(self._cycle, ()):
             if job_id not in self._jobs:
-                raise LookupError(f"cycle {self._cycle}: job {job_id} was never asked for; recorded by other software?")
+                raise LookupError(
+                    f"cycle {self._cycle}: job {job_id} was never requested; the recording may be from other software"
+                )
             done = _run(self._jobs.pop(job_id))
             if done is not None:
                 answers.append(Answer(t_mono, *done))
@@ -195,6 +197,6 @@ def _run(job: Job, pause_s: float = 0.0) -> tuple[int, object] | None:
         try:
             return job.job_id, job.run()
         except Exception:  # a job may raise anything; its failure is counted, published and logged in full
-            log.exception("background job %d failed%s", job.job_id, "; it is tried again" if left else "")
+            log.exception("background job %d failed%s", job.job_id, "; the daemon tries again" if left else "")
             time.sleep(pause_s if left else 0.0)
     return None

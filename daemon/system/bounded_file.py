@@ -45,4 +45,4 @@ def _check(found: os.stat_result, most: int) -> None:
     if kind != stat.S_IFREG:
         raise FileRefused(f"is {_KINDS.get(kind, 'something else')}, not a file")
     if found.st_size > most:
-        raise FileRefused(f"has {found.st_size} bytes; at most {most} can be read")
+        raise FileRefused(f"has {found.st_size} bytes; the limit is {most}")

@@ -64,7 +64,7 @@ class KernelLock:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            log.info("waiting for another process, which compiles kernels (it holds %s)", self._path)
+            log.info("waiting for another process that compiles kernels (it holds %s)", self._path)
             waits.set()
             try:
                 self._take_later()

@@ -47,7 +47,7 @@ class Sparing:
             return
         more, self._left_out = self._left_out, 0
         self._told += 1
-        self._log.log(level, "%s%s", text, f" ({more} more such lines were left out before it)" if more else "")
+        self._log.log(level, "%s%s", text, f" ({more} more such lines were skipped before it)" if more else "")
 
 
 class _ZonedTime(logging.Formatter):

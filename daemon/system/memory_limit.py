@@ -11,7 +11,7 @@ NEEDED: Final = 256 << 20
 """Address space in bytes that the largest library and what it allocates at once take."""
 SIGNS: Final = (os.strerror(errno.ENOMEM), "failed to map segment", "Memory allocation")
 """Parts of messages of the dynamic linker and of libraries."""
-REMEDY: Final = "raise MemoryMax=, or the limit of `ulimit -v`"
+REMEDY: Final = "raise `MemoryMax=` of the service, or the limit of `ulimit -v`"
 
 
 def lacks_memory(error: BaseException) -> bool:

@@ -58,7 +58,7 @@ def _read(path: Path, most_bytes: int) -> bytes:
         if stat.S_ISDIR(about.st_mode):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         if not stat.S_ISREG(about.st_mode):
-            raise OSError(errno.EINVAL, f"it is {_kind_of(about.st_mode)}, and no regular file", str(path))
+            raise OSError(errno.EINVAL, f"it is {_kind_of(about.st_mode)}, not a regular file", str(path))
         with os.fdopen(handle, "rb", closefd=False) as file:
             content = b"" if about.st_size > most_bytes else file.read(most_bytes + 1)
     finally:

@@ -88,7 +88,7 @@ def _place(error: BaseException) -> Place:
 
 def _shorten(record: logging.LogRecord, error: BaseException, left_out: int) -> None:
     """Replace the traceback by the error in words."""
-    more = f" ({left_out} more such lines were left out before it)" if left_out else ""
+    more = f" ({left_out} more such lines were skipped before it)" if left_out else ""
     first = record.getMessage().partition("\n")[0]
     record.msg, record.args = "%s: %s: %s%s", (first, type(error).__name__, error, more)
     record.exc_info = record.exc_text = None
@@ -119,7 +119,7 @@ def _in_thread(args: threading.ExceptHookArgs) -> None:
 
 
 def _in_finaliser(args: Any) -> None:  # sys.UnraisableHookArgs exists for the type checker alone
-    _report(args.err_msg or "an error outside any call", args.exc_type, args.exc_value, args.exc_traceback)
+    _report(args.err_msg or "an error outside a call", args.exc_type, args.exc_value, args.exc_traceback)
 
 
 def _report(what: str, kind: type[BaseException], error: BaseException | None, trace: TracebackType | None) -> None:

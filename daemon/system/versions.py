@@ -61,7 +61,7 @@ def made_elsewhere(header: Mapping[str, Any]) -> str:
     order = sorted(other, key=("lumiloop", "build", "commit", *sorted(ours)).index)
     theirs = ", ".join(f"{part} {_readable(told[part])}" for part in order)
     here = ", ".join(f"{part} {ours[part]}" for part in order if part in ours)
-    return f"recorded with {theirs}; this is {here}: the replay may differ from what ran then"
+    return f"recorded with {theirs}; this is {here}, so the replay may differ from the recorded run"
 
 
 def _readable(told: object) -> str:

@@ -120,10 +120,12 @@ def _fitted(survey: Survey, rows: Rows, priors: Priors, start: Array | None) -> 
         task.before[Common.FRAME_X : Common.FRAME_YAW + 1] = start
     begin = linear(task, rows, task.before)
     if len(rows) < FEWEST_ROWS or int(begin.seen.sum()) < FEWEST_ROWS:
-        raise TooLittle(f"only {int(begin.seen.sum())} places with a lamp in plain view; at least {FEWEST_ROWS} needed")
+        raise TooLittle(
+            f"only {int(begin.seen.sum())} positions with a lamp in view; at least {FEWEST_ROWS} are needed"
+        )
     counts = np.bincount(rows.lamp[begin.seen], minlength=len(survey.lamps))
     if counts.max() < FEWEST_OF_A_LAMP:
-        raise TooLittle(f"no lamp was seen from {FEWEST_OF_A_LAMP} places; drive under the lamps, 0.5 m apart")
+        raise TooLittle(f"no lamp was received from {FEWEST_OF_A_LAMP} positions 0.5 m apart; drive under the lamps")
     found = solve(task, rows)
     return _calibrated(task, rows, begin.residual, found)
 

@@ -85,10 +85,10 @@ def survey(heard: Heard, receiver: Receiver, depth: float, height: float | None 
     """
     z = receiver.z + USUAL_HEIGHT_M if height is None else height
     if z < receiver.z + 0.3:
-        raise ValueError(f"lamps at z = {z} m do not hang above the receiver at z = {receiver.z} m")
+        raise ValueError(f"lamps at z = {z} m are not above the receiver at z = {receiver.z} m")
     groups, left_out = _groups(heard, REACH_M * (z - receiver.z))
     if not groups:
-        raise TooLittle(f"no lamp was heard plainly from {FEWEST} places: drive under the lamps, with the decoder on")
+        raise TooLittle(f"no lamp was received well from {FEWEST} positions; drive under the lamps with the decoder on")
     alone = [_alone(rows, Lamp(n, code, 0.0, 0.0, z), receiver, depth) for n, code, rows in groups]
     start = Survey(tuple(alone), receiver, depth=depth)
     joint = [replace(rows, lamp=np.full(len(rows), k, dtype=np.int64)) for k, (_, _, rows) in enumerate(groups)]

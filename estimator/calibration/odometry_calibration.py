@@ -75,7 +75,9 @@ def fit_wheels(odometry: Array, laser: Array, mount: Array) -> WheelFit:
 
     W, L = _steps(odometry, laser)
     if len(W) < FEWEST:
-        raise ValueError(f"only {len(W)} steps of {STEP_M} m or {STEP_RAD} rad; at least {FEWEST}: drive farther")
+        raise ValueError(
+            f"only {len(W)} steps of {STEP_M} m or {STEP_RAD} rad; at least {FEWEST} are needed, so drive farther"
+        )
     begin = np.array((1.0, 1.0, 0.0, *mount))
     weight = 1.0 / np.array(NOISE)
     prior = np.array(PRIOR)

@@ -44,7 +44,7 @@ def learn(survey: Survey, rows: Rows, hyper: Hyper | None = None, cell: float = 
     parts = [_gathered(part, cell) for part in residuals_of(survey, rows)]
     some = [part for part in parts if len(part[1]) >= FEWEST]
     if not some:
-        raise ValueError(f"no lamp was seen plainly from {FEWEST} places: drive under the lamps")
+        raise ValueError(f"no lamp was received well from {FEWEST} positions; drive under the lamps")
     hyper = hyper or choose([_fewer(part, SEARCHED) for part in some[:: -(-len(some) // SEARCHED_LAMPS)]])
     reach = max(float(np.abs(part[0] - _middle(part[0])).max()) for part in some) + MARGIN_M
     nodes = 2 * int(np.ceil(reach / cell)) + 1

@@ -205,7 +205,7 @@ def image_of_cells(cells: Cells, resolution: float, T_map_cells: Array, identity
     plan = plan_of(np.ascontiguousarray(cells), resolution)
     squares = eyes_of(plan)
     if not len(plan.lines) or not squares:
-        raise ValueError("the map has no free place beside a wall: nothing could be localised in it")
+        raise ValueError("the map has no free position beside a wall, so localisation in it is impossible")
     bearing = np.linspace(-np.pi, np.pi, BEAMS, endpoint=False)
     pieces: list[Piece] = []
     frames: list[Keyframe] = []

@@ -70,14 +70,14 @@ def read_checked(path: str) -> bytes | None:
 def note_damage(path: str, reason: str) -> None:
     """Report a file as damaged; the first reason stays. The first file is logged, whichever program reads it."""
     if not CACHE_REPORT.damaged:
-        log.warning("%s cannot be used: %s; its kernel, and any others like it, are compiled again", path, reason)
+        log.warning("%s cannot be used: %s; the daemon compiles the affected kernels again", path, reason)
     CACHE_REPORT.damaged.setdefault(path, reason)
 
 
 def note_unwritten(reason: str) -> None:
     """Report that a file cannot be written; the first is logged."""
     if not CACHE_REPORT.unwritten:
-        log.warning("%s; compiled kernels cannot be stored, each start compiles them", reason)
+        log.warning("%s; compiled kernels cannot be stored, so each start compiles them", reason)
     CACHE_REPORT.unwritten = reason
 
 
@@ -87,7 +87,7 @@ def _content(path: str) -> bytes:
     try:
         about = os.fstat(handle)
         if not stat.S_ISREG(about.st_mode):
-            raise _Unusable("it is no regular file")
+            raise _Unusable("it is not a regular file")
         if about.st_size > MOST_BYTES:
             raise _Unusable(f"it has {about.st_size} bytes")
         with os.fdopen(handle, "rb", closefd=False) as file:

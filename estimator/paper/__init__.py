@@ -21,7 +21,7 @@ LUMILOOP: Final = "lumiloop"
 METHODS: Final = {
     LUMILOOP: "the method of the daemon",
     "paper": "the paper's method as printed",
-    "pic": "probabilistic iterative correspondence, the paper's baseline, which knows no light",
+    "pic": "probabilistic iterative correspondence, the paper's baseline without light",
 }
 """Description of every method by name."""
 

@@ -21,7 +21,7 @@ _PEER: Final = struct.Struct("3i")  # unix(7), SO_PEERCRED: process, user, group
 
 def taken(address: int, process: int = 0) -> OSError:
     """The error of an address that another lumiloop has claimed; ``process`` 0: its number is not known."""
-    who = f"another lumiloop (process {process})" if process else "another lumiloop, or its bus server,"
+    who = f"another lumiloop (process {process})" if process else "another lumiloop or its bus server"
     return OSError(errno.EBUSY, f"{who} uses address {address:#04x} of this bus already")
 
 

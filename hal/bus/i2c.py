@@ -144,12 +144,12 @@ def check(messages: tuple[Message, ...]) -> None:
         OSError: EINVAL, with the violated limit as text.
     """
     if not 1 <= len(messages) <= MAX_MESSAGES:
-        raise OSError(errno.EINVAL, f"{len(messages)} messages: one transaction has 1 to {MAX_MESSAGES}")
+        raise OSError(errno.EINVAL, f"{len(messages)} messages; a transaction must have 1 to {MAX_MESSAGES}")
     for message in messages:
         length = len(message.data) or message.length
         if not 0 <= message.address <= 0x7F:
             raise OSError(errno.EINVAL, f"address {message.address:#x}: 7 bits at most")
         if message.data and message.length:
-            raise OSError(errno.EINVAL, "a message either writes or reads")
+            raise OSError(errno.EINVAL, "a message must either write or read")
         if not 1 <= length <= MAX_LENGTH:
-            raise OSError(errno.EINVAL, f"{length} bytes: one message has 1 to {MAX_LENGTH}")
+            raise OSError(errno.EINVAL, f"{length} bytes; a message must have 1 to {MAX_LENGTH}")

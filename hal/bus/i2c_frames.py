@@ -88,7 +88,7 @@ class Splitter:
         while len(self._bytes) >= _HEAD.size:
             length, kind = _HEAD.unpack_from(self._bytes)
             if not 1 <= length <= MAX_FRAME:
-                raise BadFrame(f"a frame of {length} bytes")
+                raise BadFrame(f"a message of {length} bytes")
             end = 4 + length
             if len(self._bytes) < end:
                 break
@@ -156,9 +156,9 @@ def parse_hello(body: bytes) -> Hello:
     reader = _Reader(body)
     magic, version, now = reader.unpack(_HELLO)
     if magic != MAGIC:
-        raise BadFrame("this is no I2C bus server")
+        raise BadFrame("this is not an I2C bus server")
     if version != VERSION:
-        raise BadFrame(f"version {version} of the protocol; this side speaks {VERSION}")
+        raise BadFrame(f"the peer has version {version} of the protocol; this side has version {VERSION}")
     parsed = Hello(now, reader.text(), reader.text())
     reader.end()
     _check_times(now)
@@ -225,4 +225,4 @@ def parse_done(body: bytes) -> Done:
 
 def _check_times(*times: float) -> None:
     if not all(isfinite(t) for t in times) or any(b < a for a, b in pairwise(times)):
-        raise BadFrame(f"times that cannot be: {times}")
+        raise BadFrame(f"impossible times: {times}")

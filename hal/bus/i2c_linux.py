@@ -158,7 +158,7 @@ def open_linux(name: str) -> LinuxBus:
     if not link.funcs & I2cFunc.I2C:
         link.close()
         raise DeviceRefused(
-            name, f"adapter {about or path} speaks SMBus only and cannot read blocks", "use another I2C bus"
+            name, f"adapter {about or path} supports only SMBus and cannot read blocks", "use another I2C bus"
         )
     return LinuxBus(name, link, about)
 
@@ -168,17 +168,17 @@ def explain_open_error(name: str, path: Path, error: OSError) -> HalError:
     number = error.errno or 0
     if number in _GONE:
         there = buses()
-        remedy = f"there are: {', '.join(there)}" if there else ENABLE
+        remedy = f"available buses: {', '.join(there)}" if there else ENABLE
         return DeviceMissing(name, "no such bus" if number == errno.ENOENT else os.strerror(number), remedy)
     if number == errno.EPERM:
         return DeviceRefused(name, *KEPT_AWAY)
     if number == errno.EACCES:
         return DeviceRefused(name, "permission denied", f"add the user to group {_group_of(path)} and log in again")
     if number in (errno.EBUSY, errno.EAGAIN):
-        return DeviceRefused(name, "in use by another program", f"find it with: fuser -v {path}")
+        return DeviceRefused(name, "in use by another program", f"find that program with: fuser -v {path}")
     if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR, errno.ENOTDIR):
         return DeviceRefused(name, "not an I2C bus", "name a device node such as /dev/i2c-1")
-    return DeviceRefused(name, f"cannot be opened: {os.strerror(number)}", "look into the kernel log: dmesg | tail")
+    return DeviceRefused(name, f"cannot be opened: {os.strerror(number)}", "read the kernel log: dmesg | tail")
 
 
 def _group_of(path: Path) -> str:
@@ -208,5 +208,5 @@ def _find(name: str) -> Path:
         return DEV / matching[0]
     listed = "; ".join(f"{node}: {own}" for node, own in adapters.items())
     if matching:
-        raise DeviceRefused(name, f"{len(matching)} adapters have that name", f"use a path, or more of it: {listed}")
-    raise DeviceMissing(name, "no adapter has that name", f"there are: {listed}" if listed else ENABLE)
+        raise DeviceRefused(name, f"{len(matching)} adapters have that name", f"use a path, or a longer name: {listed}")
+    raise DeviceMissing(name, "no adapter has that name", f"available adapters: {listed}" if listed else ENABLE)

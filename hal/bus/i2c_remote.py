@@ -63,7 +63,7 @@ class RemoteClock:
         """
         low, high = sent - answered, received - ordered
         if self._same and (low > self.TOLERANCE_S or high < -self.TOLERANCE_S):
-            raise frames.BadFrame("times from before the request or after the answer")
+            raise frames.BadFrame("times before the request or after the reply")
         if self._low and (low > min(self._high) + self.TOLERANCE_S or high < max(self._low) - self.TOLERANCE_S):
             self._low.clear()
             self._high.clear()
@@ -182,11 +182,11 @@ class RemoteBus:
         answered = time.monotonic()
         try:
             if kind != frames.DONE:
-                raise frames.BadFrame(f"a frame of kind {kind} instead of an answer")
+                raise frames.BadFrame(f"a message of kind {kind} instead of a reply")
             answer = frames.parse_done(body)
             request = self._pending.pop(answer.number, None)
             if request is None:
-                raise frames.BadFrame(f"an answer to request {answer.number}, which was not sent")
+                raise frames.BadFrame(f"a reply to request {answer.number}, which was not sent")
             request.check(answer)
             self._clock.add(request.t, answer.received, answer.sent, answered)
             return answer if request.wanted else None
@@ -199,7 +199,7 @@ class RemoteBus:
             if kind == frames.REFUSED:
                 raise frames.parse_refused(body, self._name)
             if kind != frames.HELLO:
-                raise frames.BadFrame("this is no I2C bus server")
+                raise frames.BadFrame("this is not an I2C bus server")
             return frames.parse_hello(body)
         except frames.BadFrame as error:
             self.close()
@@ -208,7 +208,7 @@ class RemoteBus:
             self.close()
             if error.errno == errno.EPROTO:
                 raise self._no_server(error.strerror) from error
-            problem = f"no greeting: {error.strerror or error}"
+            problem = f"no hello message: {error.strerror or error}"
             raise DeviceFault(self._name, problem, "restart the bus server") from error
         except HalError:
             self.close()
@@ -293,11 +293,11 @@ def _explain(name: str, error: OSError) -> HalError:
     if isinstance(error, socket.gaierror):
         return DeviceMissing(name, "host name is not known", "name the host by its IP address")
     if error.errno in (errno.ENOENT, errno.ECONNREFUSED):
-        return DeviceMissing(name, "no bus server there", _START + name)
+        return DeviceMissing(name, "no bus server runs there", _START + name)
     if error.errno in (errno.EACCES, errno.EPERM):
-        return DeviceRefused(name, "permission denied", "the socket's mode must let this user read and write it")
+        return DeviceRefused(name, "permission denied", "give this user read and write access to the socket")
     if error.errno in (errno.EPROTOTYPE, errno.ENOTSOCK):
-        return DeviceRefused(name, "not a stream socket", "name the bus server's own socket")
+        return DeviceRefused(name, "not a stream socket", "name the socket of the bus server")
     if isinstance(error, TimeoutError):
         return DeviceMissing(name, f"no answer within {CONNECT_S:g} s", "check network, address and port")
     return DeviceMissing(name, os.strerror(error.errno) if error.errno else str(error), "check network and address")

@@ -89,7 +89,9 @@ class BusServer:
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._clients) >= CLIENTS:
-            writer.write(frames.refused(DeviceRefused(self._bus, f"{CLIENTS} clients already", "end one of them")))
+            writer.write(
+                frames.refused(DeviceRefused(self._bus, f"{CLIENTS} clients are connected already", "end one of them"))
+            )
             writer.close()
             return
         task = asyncio.current_task()
@@ -173,8 +175,8 @@ async def _put(
 
 async def _check_loopback(where: str, host: str, port: int) -> None:
     if any(not ipaddress.ip_address(address).is_loopback for _, (address, *_) in await resolve(host, port)):
-        remedy = "serve unix:/path or tcp://127.0.0.1:PORT, reach it by ssh -L; or say --anyone if the network is yours"
-        raise DeviceRefused(where, "everyone who can reach that address could write to all chips of the bus", remedy)
+        remedy = "serve unix:/path or tcp://127.0.0.1:PORT and use ssh -L, or give --anyone on a private network"
+        raise DeviceRefused(where, "every client of that address could write to all devices on the bus", remedy)
 
 
 def _remove_stale_socket(path: Path) -> None:
@@ -182,12 +184,12 @@ def _remove_stale_socket(path: Path) -> None:
     if not path.exists():
         return
     if not stat.S_ISSOCK(path.stat().st_mode):
-        raise DeviceRefused(str(path), "there is something that is no socket", "choose another path")
+        raise DeviceRefused(str(path), "the path exists and is not a socket", "choose another path")
     with socket.socket(socket.AF_UNIX) as caller, contextlib.suppress(ConnectionRefusedError):
         caller.setblocking(False)
         with contextlib.suppress(BlockingIOError):  # its queue of connections is full: it listens
             caller.connect(str(path))
-        raise DeviceRefused(str(path), "another server listens there", "end it, or choose another path")
+        raise DeviceRefused(str(path), "another server listens there", "end that server, or choose another path")
     path.unlink(missing_ok=True)
 
 

@@ -49,18 +49,18 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--world",
         default="box",
-        help="box: a small room, in which it wanders; still: it stands there; or an .npz file with an array range_mm",
+        help="box (moving in a small room), still (at rest in it), or an .npz file with an array range_mm",
     )
     add("--pty", type=Path, metavar="LINK", help="serve as a serial port, found by this symbolic link")
     add("--tcp", metavar="HOST:PORT", help="serve over TCP, port 0 chooses a free one")
     add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults, starts at once")
-    add("--control", type=Path, metavar="SOCKET", help="take fault orders on a unix socket while running")
-    add("--serial", default="H0000001", help="serial number the sensor states (default %(default)s)")
-    add("--clock-ms", type=int, default=0, help="what the sensor's 24-bit clock shows at the start")
-    add("--clock-ppm", type=float, default=0.0, help="how much the sensor's clock is fast, in ppm")
-    add("--cold", action="store_true", help="start with the sensor's start-up")
+    add("--control", type=Path, metavar="SOCKET", help="accept fault commands on a unix socket")
+    add("--serial", default="H0000001", help="serial number of the sensor (default %(default)s)")
+    add("--clock-ms", type=int, default=0, help="initial value of the sensor's 24-bit clock")
+    add("--clock-ppm", type=float, default=0.0, help="rate error of the sensor's clock, in ppm")
+    add("--cold", action="store_true", help="begin with the start-up of the sensor")
     add("--seconds", type=float, default=0.0, help="end after this time (default: run until interrupted)")
-    add("--seed", type=int, default=0, help="of noise, jitter and faults left to chance")
+    add("--seed", type=int, default=0, help="seed of noise, jitter and random faults")
     return parser
 
 
@@ -85,7 +85,7 @@ async def _serve(options: _Options) -> None:
     schedule = FaultSchedule({"lidar": device})
     if options.faults is not None:
         faults = schedule.load(options.faults.read_text(encoding="utf-8"))
-        print_line(f"{len(faults)} faults of {options.faults} ordered")
+        print_line(f"{len(faults)} faults of {options.faults} scheduled")
     pty = tcp = control = None
     try:
         if options.tcp is not None:
@@ -97,7 +97,7 @@ async def _serve(options: _Options) -> None:
             print_line(f"{options.model} on {pty.path}")
         if options.control is not None:
             control = await serve_control(Control(schedule), options.control)
-            print_line(f"fault orders on {options.control}")
+            print_line(f"fault commands on {options.control}")
         await until_stopped(options.seconds)
     finally:
         schedule.close()
@@ -110,7 +110,7 @@ async def _serve(options: _Options) -> None:
         device.close()
     counts = device.counts
     print_line(
-        f"{device.scans_sent} scans made; replies: {counts.sent} sent, {counts.without_host} unheard, "
+        f"{device.scans_sent} scans made; replies: {counts.sent} sent, {counts.without_host} without a host, "
         f"{counts.lost_in_sensor} lost in the sensor, {counts.refused_by_host} lost at a full queue"
     )
 
@@ -124,7 +124,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run until interrupted; 2 when something in the arguments is wrong."""
     options = _Options(**vars(_parser().parse_args(arguments)))
     if options.pty is not None and options.tcp is not None:
-        sys.stderr.write("one sensor has one line: give --pty or --tcp\n")
+        sys.stderr.write("a sensor has one line; give --pty or --tcp\n")
         return 2
     if options.tcp is not None and not _is_address(options.tcp):
         sys.stderr.write(f"--tcp {options.tcp}: expected HOST:PORT, as 127.0.0.1:10940\n")

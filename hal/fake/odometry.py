@@ -24,17 +24,17 @@ Source = Callable[[float], tuple[float, Pose] | None]
 ODOMETRY: Vocabulary = {
     # the general words
     "off": Word("the controller has no power; afterwards it counts from zero, as a new session", "lasts"),
-    "stuck": Word("the same pose again and again under running numbers; afterwards it has caught up", "lasts"),
+    "stuck": Word("the same pose repeatedly with running numbers; afterwards the correct pose", "lasts"),
     "garbage": Word("random bytes of the same length instead", "strikes"),
-    "wrong": Word("ways and turns it tells are `factor` times as large", "lasts",
+    "wrong": Word("its distances and turns are `factor` times as large", "lasts",
                   {"factor": Parameter(1.5, -10.0, 10.0)}),
-    "slow": Word("it sends `factor` times as seldom", "lasts", {"factor": Parameter(4.0, 1.0, 1000.0)}),
+    "slow": Word("its rate is `factor` times lower", "lasts", {"factor": Parameter(4.0, 1.0, 1000.0)}),
     "delayed": Word("datagrams arrive `by_s` later", "lasts", {"by_s": Parameter(0.3, 0.0, 60.0)}),
     "intermittent": Word("datagrams are lost on the way", "strikes", share=0.5),
     # what a network and a controller do besides
     "jump": Word("the pose jumps by `by_m` ahead", "once", {"by_m": Parameter(3.0, -1e3, 1e3)}),
-    "restart": Word("the controller starts anew: another session, counting from zero", "once"),
-    "blocked": Word("the wheels' counters stand still; what was driven meanwhile is never counted", "lasts"),
+    "restart": Word("the controller restarts: another session, counting from zero", "once"),
+    "blocked": Word("the wheel counters stop; the motion in that time is never counted", "lasts"),
 }  # fmt: skip
 """By word. ``off stuck garbage wrong slow delayed intermittent`` are common to all devices."""
 

@@ -74,7 +74,9 @@ class HokuyoDriver:
         intensity: bool = False,
     ) -> None:
         if baud and baud not in BAUD_RATES:
-            raise ValueError(f"baud {baud}: SCIP knows {', '.join(map(str, BAUD_RATES))}, or 0 to choose by itself")
+            raise ValueError(
+                f"line rate {baud}: SCIP has {', '.join(map(str, BAUD_RATES))}, or 0 for automatic detection"
+            )
         self._device = device
         self._clock = clock
         self._opener = opener
@@ -184,9 +186,9 @@ class HokuyoDriver:
                 return await self._open(device)
             except HalError as error:
                 problems.append(error)
-        wanted = f"no HOKUYO {self._serial} found" if self._serial else "no HOKUYO found"
+        wanted = f"no HOKUYO {self._serial} was found" if self._serial else "no HOKUYO was found"
         if not problems:
-            raise DeviceMissing(AUTO, wanted, "plug the sensor in, or name its device file")
+            raise DeviceMissing(AUTO, wanted, "connect the sensor, or name its device file")
         telling = (type(e) for kind in (NotReady, DeviceRefused) for e in problems if isinstance(e, kind))
         kind = next(telling, type(problems[0]))
         raise kind(AUTO, f"{wanted}: {'; '.join(map(str, problems))}")
@@ -286,7 +288,7 @@ class HokuyoDriver:
             return request
         verdict = "the model has none"
         if request.name == "ME":
-            verdict = "given up after failures" if self._faults >= _REOPEN_FROM else await session.prove(request)
+            verdict = "stopped after failures" if self._faults >= _REOPEN_FROM else await session.prove(request)
         self._status.extra["intensity"] = f"off: {verdict}" if verdict else "on"
         if not verdict:
             return request
@@ -305,7 +307,7 @@ class HokuyoDriver:
                 self._faults = self._attempts = 0
                 self._reboots.add_success(scan.t_rx)
                 if self._loss_logged or not self._announced:
-                    word = "delivers again" if self._loss_logged else f"(serial {scan.geometry.serial}) delivers"
+                    word = "delivers again" if self._loss_logged else f"(serial {scan.geometry.serial}) delivers scans"
                     log.info("%s: lidar %s %s", self._status.extra["device"], scan.geometry.model, word)
                     self._loss_logged, self._announced = False, True
             if self._logged and scan.t_rx - began > _CALM_S:

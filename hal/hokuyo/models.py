@@ -158,7 +158,7 @@ def identify(device: str, vv: dict[str, str], pp: dict[str, str]) -> Identity:
     dmax = min(dmax, 0x3FFFF)  # the largest value that a reply can carry
     front = abs(numbers["AFRT"]) <= 2 * ares  # it may lie outside the field of view
     if not (numbers["SCAN"] > 0 and 0 <= amin < amax <= ares <= 9999 and front and 0 <= dmin < dmax):
-        raise DeviceRefused(device, f"PP contradicts itself: {pp}", "is this a HOKUYO 2D lidar?")
+        raise DeviceRefused(device, f"PP reply is inconsistent: {pp}", "check that it is a HOKUYO 2D lidar")
     period_s = 60.0 / numbers["SCAN"]
     product, firmware = vv.get("PROD", ""), vv.get("FIRM", "")
     model = pp.get("MODL", "") or product
@@ -186,13 +186,17 @@ def _number(device: str, key: str, text: str) -> float:
     """The number in a value of PP, without its unit; raises `DeviceRefused`."""
     found = _NUMBER.fullmatch(text)
     if found is None:
-        raise DeviceRefused(device, f"PP says {key}={text[:20]!r}, expected a number", "is this a HOKUYO 2D lidar?")
+        raise DeviceRefused(
+            device, f"PP reply has {key}={text[:20]!r}, expected a number", "check that it is a HOKUYO 2D lidar"
+        )
     return float(found[1])
 
 
 def _whole(device: str, key: str, value: float) -> int:
     if not value.is_integer():
-        raise DeviceRefused(device, f"PP says {key}={value:g}, expected a whole number", "is this a HOKUYO 2D lidar?")
+        raise DeviceRefused(
+            device, f"PP reply has {key}={value:g}, expected a whole number", "check that it is a HOKUYO 2D lidar"
+        )
     return int(value)
 
 

@@ -77,7 +77,7 @@ class ScanRequest:
 
     def __post_init__(self) -> None:
         if self.name not in _STREAMS | _SINGLES:
-            raise ValueError(f"{self.name!r} is no scan command")
+            raise ValueError(f"{self.name!r} is not a scan command")
         for field, most in (("start", 9999), ("end", 9999), ("cluster", 99), ("skip", 9), ("count", 99)):
             if not 0 <= getattr(self, field) <= most:
                 raise ValueError(f"{field}={getattr(self, field)}: expected 0..{most}")
@@ -198,7 +198,7 @@ def parse_scan(request: ScanRequest, reply: Reply) -> ScanReply:
         BadFrame: a rule of the format is broken; a damaged frame yields no data.
     """
     if reply.status != (DATA if request.streaming else ACCEPTED):
-        raise BadFrame(Flaw.STATUS, f"{reply.status} is no data")
+        raise BadFrame(Flaw.STATUS, f"{reply.status} is not a data status")
     remaining = request.remaining(reply.echo)
     body = reply.body
     if len(body) < _STAMP_LINE or body[5] != 0x0A:

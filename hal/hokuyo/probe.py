@@ -37,14 +37,14 @@ class Finding:
         if self.error is not None:
             return str(self.error)
         if self.geometry is None:
-            return f"{self.device}: nothing known"
+            return f"{self.device}: no data"
         g = self.geometry
         low, high = ((step - g.afrt) * 360.0 / g.ares for step in (g.amin, g.amax))
         line = f", {self.baud} bit/s" if self.baud else ""
         return (
             f"{self.device}: {g.model}, serial {g.serial}, firmware {g.firmware}, {self.protocol}{line}; "
             f"{g.amax - g.amin + 1} beams from {low:+.1f} to {high:+.1f} deg, {1.0 / g.period_s:.1f} Hz, "
-            f"{g.dmin * g.range_unit_m:g} to {g.dmax * g.range_unit_m:g} m; {self.state or 'state not told'}"
+            f"{g.dmin * g.range_unit_m:g} to {g.dmax * g.range_unit_m:g} m; {self.state or 'state unknown'}"
         )
 
 

@@ -51,7 +51,7 @@ class Flaw(Enum):
     CHARACTER = "character that SCIP does not use"
     ECHO = "echo of another command"
     LENGTH = "wrong number of steps"
-    TEXT = "text line that is none"
+    TEXT = "invalid text line"
 
 
 class BadFrame(ValueError):
@@ -97,7 +97,7 @@ def tagged(command: bytes, tag: str) -> bytes:
 def baud_command(baud: int) -> bytes:
     """``SS``: change the RS-232 rate; the answer still comes at the old one. Raises `ValueError` for other rates."""
     if baud not in BAUD_RATES:
-        raise ValueError(f"{baud} bit/s: SCIP knows {', '.join(map(str, BAUD_RATES))}")
+        raise ValueError(f"{baud} bit/s: SCIP has {', '.join(map(str, BAUD_RATES))}")
     return b"SS%06d\n" % baud
 
 

@@ -13,7 +13,7 @@ from hal.errors import DataInvalid, DeviceFault, DeviceMissing, DeviceRefused, H
 from hal.hokuyo import scip
 
 POWER_CYCLE: Final = "switch its power off and on"
-_TRIED_AGAIN: Final = "it is tried again by itself"
+_TRIED_AGAIN: Final = "the daemon tries again automatically"
 _HEALTHY: Final = re.compile(r"works? well|no error|normal", re.IGNORECASE)
 _STARTING: Final = re.compile(r"\b(boot|start|warm|wak|initiali|spin)", re.IGNORECASE)
 _FAILED: Final = re.compile(r"trouble|(?<!no )error|fail|abnormal", re.IGNORECASE)
@@ -83,9 +83,13 @@ def _by_status(device: str, text: str, status: str) -> HalError:
     if status in scip.NOT_NOW:
         return NotReady(device, f"{text}: not now (starting up, or in another mode)", _TRIED_AGAIN)
     if 50 <= number <= 97:
-        return DeviceFault(device, f"{text}: hardware trouble (laser, motor)", f"{POWER_CYCLE}; else have it repaired")
+        return DeviceFault(
+            device,
+            f"{text}: hardware fault (light source, motor)",
+            f"{POWER_CYCLE}; if it persists, have the sensor repaired",
+        )
     if 21 <= number <= 49:
-        return DeviceFault(device, f"{text}: it is checking itself for a fault", POWER_CYCLE)
+        return DeviceFault(device, f"{text}: the sensor runs a self-test", POWER_CYCLE)
     if 1 <= number <= 7:
-        return DeviceRefused(device, f"{text}: it does not accept the range it states itself", "report the model")
+        return DeviceRefused(device, f"{text}: the sensor rejects the range that it states", "report the model")
     return DeviceFault(device, text, POWER_CYCLE)

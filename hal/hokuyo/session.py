@@ -44,9 +44,9 @@ _AFTER_RATE_S: Final = 0.15
 _AFTER_REBOOT_S: Final = 2.0
 _REPORT_S: Final = 5.0
 """II is queried no more often than this after failures: old firmware fails under many queries (urg_c PR 4)."""
-_NO_ANSWER: Final = "is it a HOKUYO, powered, its cable right?"
-_UNREADABLE: Final = "only unreadable bytes come"
-_OTHER_PORT: Final = "name the lidar's own port, and no line rate behind it"
+_NO_ANSWER: Final = "check that it is a HOKUYO, and check its power and cable"
+_UNREADABLE: Final = "only unreadable bytes arrive"
+_OTHER_PORT: Final = "name the lidar's port without a line rate"
 
 
 class Session:
@@ -113,8 +113,8 @@ class Session:
                 return reply
         if self.line.is_foreign:
             raise self.foreign_device(self.line.first_bytes)
-        problem = _UNREADABLE if self.line.dropped_bytes else "nothing answers"
-        remedy = "is another client connected? it serves one" if self.device.startswith("tcp:") else _NO_ANSWER
+        problem = _UNREADABLE if self.line.dropped_bytes else "no reply"
+        remedy = "disconnect other clients; it serves only one" if self.device.startswith("tcp:") else _NO_ANSWER
         raise DeviceFault(self.device, problem, remedy)
 
     def foreign_device(self, first: bytes) -> DeviceFault:
@@ -122,10 +122,8 @@ class Session:
 
         The bytes stand in the remedy: a problem is logged once per text, and the bytes differ each time.
         """
-        other = "name the lidar's own address and port" if self.device.startswith("tcp:") else _OTHER_PORT
-        return DeviceFault(
-            self.device, _UNREADABLE, f"something is there that is not SCIP, {printable(first)!r}: {other}"
-        )
+        other = "name the address and port of the lidar" if self.device.startswith("tcp:") else _OTHER_PORT
+        return DeviceFault(self.device, _UNREADABLE, f"the device does not use SCIP, {printable(first)!r}: {other}")
 
     async def find_rate(self, first: int = 0) -> None:
         """Find the rate of an RS-232 line: try ``first``, then every SCIP rate.
@@ -149,7 +147,7 @@ class Session:
             strange = max(strange, self.line.first_bytes, key=legible)
         if strange:
             raise self.foreign_device(strange)
-        raise DeviceFault(self.device, "nothing answers at any line rate", _NO_ANSWER)
+        raise DeviceFault(self.device, "no reply at any line rate", _NO_ANSWER)
 
     async def reset(self) -> None:
         """Reset: default speed, clock at zero, laser off; keeps the line rate where the model allows.
@@ -221,7 +219,7 @@ class Session:
         """The lines of a text reply, after up to ``tries`` queries of which ``silences`` may remain unanswered."""
         name = command[:2].decode()
         seen = b""
-        problem = f"{name}: no answer, though QT is answered"
+        problem = f"{name}: no reply, but QT is answered"
         kind: type[DeviceFault] = NotReady
         for _ in range(tries):
             frame = await self._try_frame(command, _TEXT_S)
@@ -234,7 +232,7 @@ class Session:
                 reply = parse_reply(frame)
                 if reply.status == scip.ACCEPTED:
                     return parse_text(reply, strict=frame != seen)  # same bytes twice: the firmware sums differently
-                problem = f"{name}: answer {reply.status}"
+                problem = f"{name}: reply {reply.status}"
                 kind = NotReady if reply.status in scip.NOT_NOW else DeviceFault
                 if reply.status in scip.NOT_NOW:  # some firmware accepts QT in time-adjust mode and stays there
                     await self._try(scip.TM_LEAVE, _TEXT_S)
@@ -264,7 +262,7 @@ class Session:
                 self.baud = baud
                 return
         remedy = f"name a lower rate: lidar.device = {self.device}@19200"
-        raise DeviceFault(self.device, f"lost after changing to {baud} bit/s", remedy)
+        raise DeviceFault(self.device, f"the connection was lost after the change to {baud} bit/s", remedy)
 
     async def prove(self, request: ScanRequest) -> str:
         """Test a mode that not every firmware supports with a single scan; "" if it is valid, else the problem."""

@@ -20,7 +20,7 @@ _PATIENCE_S: Final = 1.0
 _PATIENCE_PERIODS: Final = 10
 _LOOK_S: Final = 0.25
 _SELF_CHECK_S: Final = 10.0  # a sensor that stopped to verify an error (status 21 to 49) takes seconds
-_WATCH_CABLE: Final = "check its cable and power; it is restarted by itself"
+_WATCH_CABLE: Final = "check its cable and power; the daemon restarts it automatically"
 
 
 class StreamWatch:
@@ -89,7 +89,7 @@ class StreamWatch:
         if scan is None:
             self._reject("a stamp that does not continue the sensor's clock")
             if self._stream.stuck:
-                self._end(DeviceFault(self._line.port.name, "repeats one scan for ever (its clock stands)"))
+                self._end(DeviceFault(self._line.port.name, "repeats one scan, and its clock has stopped"))
             return
         status.scans += 1
         status.error = None
@@ -126,12 +126,12 @@ class StreamWatch:
     def _silence(self) -> HalError:
         name = self._line.port.name
         if self._note_dropped() and not self._damaged:
-            return DataInvalid(name, "only unreadable bytes come", "check its cable and, on RS-232, the line rate")
+            return DataInvalid(name, "only unreadable bytes arrive", "check its cable and, on RS-232, the line rate")
         if self._damaged:
-            return DataInvalid(name, f"only damaged frames come ({self._damaged})", _WATCH_CABLE)
+            return DataInvalid(name, f"only damaged replies arrive ({self._damaged})", _WATCH_CABLE)
         if self._unready and not self.scans:
             return explain_status(name, "stream", self._unready)
-        what = "has fallen silent" if self.scans else f"sends no scan within {FIRST_SCAN_S:g} s"
+        what = "has stopped sending" if self.scans else f"sends no scan within {FIRST_SCAN_S:g} s"
         return DeviceFault(name, what, _WATCH_CABLE)
 
     def _end_on_lost(self) -> None:

@@ -94,7 +94,7 @@ async def resolve(host: str, port: int, *, passive: bool = False) -> list[Addres
         _interface(host)
     except OSError as error:
         problem = f"no network interface {host.partition('%')[2]} on this computer"
-        raise DeviceMissing(f"{host}:{port}", problem, f"name one that there is: {_interfaces()}") from error
+        raise DeviceMissing(f"{host}:{port}", problem, f"name an existing one: {_interfaces()}") from error
     look_up = partial(socket.getaddrinfo, host, port, type=socket.SOCK_DGRAM, flags=flags)
     try:
         return _addresses(await run_in_thread(look_up, "names"))
@@ -138,11 +138,11 @@ def refusal(device: str, option: str, port: int, error: OSError) -> HalError:
         return DeviceRefused(device, "the port is in use", f"stop the other program, or choose another {option}")
     if error.errno in (errno.EACCES, errno.EPERM) and 0 < port < PRIVILEGED:
         remedy = (
-            f"ports below {PRIVILEGED} need a capability: choose another {option} (Modbus: 1502), or give the service "
+            f"ports below {PRIVILEGED} need a capability; choose another {option} (Modbus: 1502), or set "
             "AmbientCapabilities=CAP_NET_BIND_SERVICE"
         )
         return DeviceRefused(device, "permission denied", remedy)
     if error.errno in (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT):
         remedy = "set bind to an address of this computer (0.0.0.0: all, 127.0.0.1: this computer only)"
         return DeviceMissing(device, "this computer does not have that address", remedy)
-    return DeviceRefused(device, error.strerror or str(error), "see the system's log")
+    return DeviceRefused(device, error.strerror or str(error), "read the system log")

@@ -74,9 +74,9 @@ def decode(data: bytes) -> InputDatagram:
     if body is None:
         raise DataInvalid(_DEVICE, f"unknown magic {magic!r}", "expected LUOD or LUIM")
     if version != VERSION:
-        raise DataInvalid(_DEVICE, f"version {version}", f"this daemon knows version {VERSION}")
+        raise DataInvalid(_DEVICE, f"version {version}", f"this daemon reads version {VERSION}")
     if length != len(data) or length != _HEAD.size + body.size + _CRC.size:
-        raise DataInvalid(_DEVICE, f"says {length} bytes and has {len(data)}")
+        raise DataInvalid(_DEVICE, f"its length field is {length}, but it has {len(data)} bytes")
     if _CRC.unpack_from(data, length - _CRC.size)[0] != zlib.crc32(data[: -_CRC.size]):
         raise DataInvalid(_DEVICE, "CRC-32 differs")
     t_sender, *values = body.unpack_from(data, _HEAD.size)

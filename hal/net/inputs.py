@@ -234,13 +234,13 @@ class InputPort:
         except DataInvalid as error:
             self.invalid += 1
             if self._damage.to_log(t_rx):
-                log.info("port %d: what %s sends is no reading: %s", self.port, peer, error)
+                log.info("port %d: a datagram from %s is not a valid reading: %s", self.port, peer, error)
             return
         kind = self._kinds[datagram.magic]
         lost, foreign = kind.counts.lost, kind.counts.foreign
         if not kind.accept(datagram.session, datagram.seq, t_rx):
             if kind.counts.foreign > foreign and self._rivals[datagram.magic].to_log(t_rx):
-                text = "port %d: readings of %s are ignored while another sender is heard there (end one of them)"
+                text = "port %d: readings from %s are ignored while another sender is active (end one of them)"
                 log.warning(text, self.port, peer)
             return
         t_mono = self._reading_time(datagram, t_rx, kind.restarted)

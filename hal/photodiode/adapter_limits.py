@@ -24,7 +24,7 @@ _REPEATS_LONG: Final = 3
 _PAUSE: Final = 0.03
 """A read that exceeds theory by more than this share contains a pause."""
 _UNFIT: Final = {
-    "i2c-gpio": "the processor clocks this bus bit by bit, and is interrupted",
+    "i2c-gpio": "the processor clocks this bus in software, with interruptions",
     "FT260": "USB: it reads 60 bytes at a time and pauses",
     "MCP2221": "USB: it reads 60 bytes at a time and pauses",
     "CP2112": "USB: it reads 61 bytes at a time and pauses",
@@ -101,8 +101,8 @@ async def measure(bus: AsyncBus, address: int, block_s: float) -> AdapterLimits:
     if found is None:
         raise DeviceRefused(
             bus.name,
-            f"adapter {bus.about} cannot read {LENGTHS[0]} bytes in one go ({limit})",
-            "end what else reads on this bus; if nothing does, use an I2C controller of the processor itself",
+            f"adapter {bus.about} cannot read {LENGTHS[0]} bytes at once ({limit})",
+            "end other readers of this bus; without any, use an I2C controller of the processor",
         )
     wanted = min(_wanted(block_s, found.scl_hz), MAX_LENGTH)
     shorter = limit if found.length < wanted else ""

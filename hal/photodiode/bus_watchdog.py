@@ -114,13 +114,13 @@ class WatchedBus:
     def _silent_error(self) -> HalError:
         return DeviceFault(
             self.name,
-            f"nothing has been read for {BLOCKS} blocks",
-            "it is tried again by itself; if that lasts, look at the wiring and into the kernel log",
+            f"no data were read for {BLOCKS} blocks",
+            "the daemon tries again; if it persists, check the wiring and the kernel log",
         )
 
     def _hang_error(self) -> HalError:
         return BusStuck(
             self.name,
             f"a transaction has not returned for {HANG_S:g} s",
-            "the adapter's driver hangs: unbind and bind it, or restart the computer",
+            "the adapter's driver does not respond; unbind and bind it, or restart the computer",
         )

@@ -64,9 +64,10 @@ def chip_named(name: str) -> BlockChip:
     known = ", ".join(_CHIPS)
     if name.lower() in _LEVEL_ONLY:
         raise ValueError(
-            f"chip {name}: samples by a clock of its own, so it tells levels only; decode lights with one of {known}"
+            f"converter {name}: it samples by its own clock, so it measures levels only; to decode lamps use "
+            f"one of {known}"
         )
     if name.lower() not in _CHIPS:
-        raise ValueError(f"chip {name}: not known; known are {known}")
+        raise ValueError(f"converter {name}: unknown; supported are {known}")
     module, _, attribute = _CHIPS[name.lower()].partition(":")
     return cast(BlockChip, getattr(importlib.import_module(module), attribute))

@@ -34,7 +34,9 @@ _SLOW: Final = 1.12
 """Longest conversion over its nominal duration: a running one of another program's is completed first."""
 CALM_S: Final = 60.0
 """A problem is over, and is logged anew, after it has been absent for this long (s)."""
-FOREIGN: Final = "another program changes the chip's configuration: end it, or give it a chip of its own"
+FOREIGN: Final = (
+    "another program changes the configuration of the converter; end that program, or use separate converters"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +169,7 @@ class LevelMeter:
         if problem:
             return problem
         if not ads1x15.same_configuration(await self._write(bus), self._wanted):
-            return "does not keep its configuration: another kind of chip"
+            return "does not keep its configuration, so it is another kind of converter"
         settled_s = SETTLE_S if self._set and not self.shared else self._settle_s
         self._set = True
         await asyncio.sleep(settled_s)

@@ -97,44 +97,54 @@ class BlockDiagnosis:
         if defects.floated:
             problem, remedy = "every bit reads 1: the bus floats", "check the converter's power, its ground, and SDA"
             return DeviceFault(self._device, f"{self._where}: {problem}", remedy)
-        what = "words without their highest bits" if defects.lost_bits else "words with bits it keeps at zero"
+        what = (
+            ("data words without their highest bits")
+            if defects.lost_bits
+            else "data words with bits that it keeps at zero"
+        )
         return DataInvalid(
             self._device,
             f"{self._where}: {what}",
-            "another kind of chip, or bits lost on the bus: check chip, address, wiring and pull-ups",
+            "check converter type, address, wiring and pull-ups",
         )
 
     def _clipped_error(self) -> HalError:
         return Clipping(
             self._device,
-            f"{self._where}: more than {100 * CLIPPED_SHARE:.0f} % of the samples are at the rails",
-            "too much modulated or flickering light: shade the photodiode or lower the gain",
+            f"{self._where}: more than {100 * CLIPPED_SHARE:.0f} % of the samples are at the limits of the converter",
+            "reduce modulated or flickering light: shade the photodiode or lower the gain",
         )
 
     def _at_rail_error(self) -> HalError:
         return NoSignal(
             self._device,
-            f"{self._where}: every word is at the same rail",
-            "check the wire from amplifier to converter, its supply, and that it is this kind of chip",
+            f"{self._where}: every data word is at the same limit of the converter",
+            "check the wire from amplifier to converter, its supply, and the converter type",
         )
 
     def _nothing_error(self, level: float | None, *, frozen: bool) -> HalError:
         """The error of a missing signal; its cause follows from the mean light, and from whether the words change."""
         kind: type[NoSignal] = NoSignal
         if level is None:
-            problem = "no signal: no light at all, or so much that the amplifier is saturated"
-            problem += ", or a dead converter" if frozen else ""
-            remedy = "look at photodiode and lamps; a DC channel (ADS1115) would tell which"
+            problem = "no signal: no light, or so much that the amplifier is saturated"
+            problem += ", or a defective converter" if frozen else ""
+            remedy = "check photodiode and lamps; a DC channel (ADS1115) distinguishes the causes"
         elif level >= DAZZLED:
             kind = Dazzled
-            problem, remedy = "dazzled: the amplifier is saturated", "shade the photodiode or lower the gain"
+            problem, remedy = (
+                ("saturated: there is too much light for the amplifier"),
+                "shade the photodiode or lower the gain",
+            )
         elif level <= DARK:
             kind = Dark
-            problem, remedy = "dark: no light reaches the photodiode", "look for a cover, a broken cable, lamps off"
+            problem, remedy = (
+                "dark: no light reaches the photodiode",
+                ("check for a cover, a broken cable, and lamps that are off"),
+            )
         elif frozen:
-            problem = "constant words, though there is light: the converter or its input is dead"
+            problem = "constant data words in spite of light: the converter or its input is defective"
             remedy = "switch its power off and on; check the wire from amplifier to converter"
         else:
-            problem = "there is light, but no lamp in it: nothing flickers"
-            remedy = "look whether coded lamps are on and in view; check the coupling capacitor"
+            problem = "there is light, but no modulated light"
+            remedy = "check that coded lamps are on and in view; check the coupling capacitor"
         return kind(self._device, f"{self._where}: {problem}", remedy)

@@ -79,7 +79,7 @@ class PhotodiodeAdc:
         self._chip: BlockChip = chip_named(chip)
         if address not in self._chip.addresses:
             possible = ", ".join(f"{a:#04x}" for a in sorted(self._chip.addresses))
-            raise ValueError(f"address {address:#04x}: a {self._chip.name} answers at one of {possible}")
+            raise ValueError(f"address {address:#04x}: an {self._chip.name} has one of the addresses {possible}")
         if not 0.001 <= sampling.block_s <= 1.0:
             raise ValueError(f"block_s {sampling.block_s:g}: expected 0.001 to 1 s")
         self._bus, self._address, self._opener = bus, address, opener
@@ -129,8 +129,8 @@ class PhotodiodeAdc:
         try:
             await asyncio.wait({opening}, timeout=HANG_S)
             if not opening.done():
-                problem = f"the bus has been opening for {HANG_S:g} s"
-                remedy = "the adapter's driver hangs, or the bus server does: restart it, or the computer"
+                problem = f"opening the bus has taken {HANG_S:g} s"
+                remedy = "the adapter's driver or the bus server does not respond; restart it, or the computer"
                 self._note_silence(BusStuck(self._bus, problem, remedy), True)
             return await opening
         except asyncio.CancelledError:
@@ -149,14 +149,16 @@ class PhotodiodeAdc:
         problem = chip.mismatch(tuple([await read_register(bus, address, query) for query in chip.queries]))
         if problem:
             raise WrongChip(
-                self._bus, f"the chip at {address:#04x} is no {chip.name}: it {problem}", "check chip and address"
+                self._bus,
+                f"the converter at {address:#04x} is not an {chip.name}: it {problem}",
+                "check converter type and address",
             )
         for message in chip.setup:
             await bus.transfer((write(address, message),))
         found = await measure(bus, address, self._block_s)
         if found.limit and found.limit != self._limit:
             log.warning(
-                "%s: blocks of %d samples, not fit for decoding lights: %s", self._bus, found.length // 2, found.limit
+                "%s: blocks of %d samples cannot be used to decode lamps: %s", self._bus, found.length // 2, found.limit
             )
         self._limit = found.limit
         return found
@@ -210,7 +212,7 @@ class PhotodiodeAdc:
             self._log_once(error)
         elif self._logged:
             self._logged.clear()
-            log.info("%s: %s at %#04x delivers again", self._bus, self._chip.name, self._address)
+            log.info("%s: %s at %#04x delivers samples again", self._bus, self._chip.name, self._address)
         status.error = error
 
     async def _measure_level(self, bus: AsyncBus, meter: LevelMeter) -> None:

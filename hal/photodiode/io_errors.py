@@ -37,11 +37,11 @@ _ABSENT: Final = Policy(
     pause_s=0.01,
 )
 _UNPLUGGED: Final = Policy(
-    DeviceMissing, "the adapter is gone", "plug it in, or start its server, again; it is reopened"
+    DeviceMissing, "the adapter was removed", "connect it or start its server again; the daemon reopens it"
 )
 _NOT_ALLOWED: Final = Policy(DeviceRefused, "permission denied", "add the user to group i2c and log in again")
 _TOO_MUCH: Final = Policy(
-    DeviceRefused, "the adapter does not do such reads", "use an I2C controller of the processor itself"
+    DeviceRefused, "the adapter does not support these reads", "use an I2C controller of the processor"
 )
 
 POLICIES: Final[dict[int, Policy]] = {
@@ -50,7 +50,7 @@ POLICIES: Final[dict[int, Policy]] = {
     errno.ETIMEDOUT: Policy(
         BusStuck,
         "the bus is stuck (a transaction timed out)",
-        "switch the converter's power off and on; look for SDA or SCL held low",
+        "switch the converter's power off and on; check whether SDA or SCL is held low",
         retries=2,
         pause_s=0.01,
         send_stop=True,
@@ -58,21 +58,21 @@ POLICIES: Final[dict[int, Policy]] = {
     errno.EIO: Policy(
         DeviceFault,
         "transactions fail (EIO)",
-        "check wiring, pull-ups and cable length; look into the kernel log",
+        "check wiring, pull-ups and cable length; read the kernel log",
         retries=2,
         pause_s=0.01,
         send_stop=True,
     ),
     errno.EAGAIN: Policy(
         DeviceFault,
-        "arbitration on the bus is lost again and again",
-        "look for noise on SDA and SCL, or a second master",
+        "arbitration on the bus is lost repeatedly",
+        "check for noise on SDA and SCL, and for a second master",
         retries=10,
     ),
     errno.EBUSY: Policy(
         DeviceRefused,
         "address {address} is in use by another lumiloop or program, or by a kernel driver",
-        "end the other one (fuser -v /dev/i2c-N; systemctl status lumiloop), or unbind the driver",
+        "end the other program (fuser -v /dev/i2c-N, systemctl status lumiloop), or unbind the driver",
         retries=3,  # `lumiloop probe` holds an address for some 10 ms
         pause_s=0.05,
     ),
@@ -83,14 +83,16 @@ POLICIES: Final[dict[int, Policy]] = {
     errno.ENOENT: _UNPLUGGED,
     errno.EACCES: _NOT_ALLOWED,
     errno.EPERM: _NOT_ALLOWED,
-    errno.EPROTO: Policy(DeviceFault, "the adapter's protocol has failed (EPROTO)", "replug the adapter"),
+    errno.EPROTO: Policy(
+        DeviceFault, "the adapter's protocol has failed (EPROTO)", "disconnect the adapter and connect it again"
+    ),
 }
 
 
 def policy_for(error: OSError) -> Policy:
     """The response to an error; an unlisted one reopens the bus."""
     number = error.errno or 0
-    unknown = Policy(DeviceFault, f"unexpected error: {os.strerror(number)}", "look into the kernel log: dmesg | tail")
+    unknown = Policy(DeviceFault, f"unexpected error: {os.strerror(number)}", "read the kernel log: dmesg | tail")
     return POLICIES.get(number, unknown)
 
 

@@ -20,7 +20,7 @@ from hal.photodiode.dc_channel import read_register
 from hal.photodiode.io_errors import explain
 
 ADDRESSES: Final = tuple(sorted(mcp3221.ADDRESSES | ads1x15.ADDRESSES | adc121c021.ADC121C021.addresses))
-_ELSE: Final = "something that is none of the converters known here"
+_ELSE: Final = "an unsupported device"
 _FATAL: Final = frozenset({errno.ETIMEDOUT, errno.ENODEV, errno.ESHUTDOWN, errno.EACCES, errno.EPERM})
 """Errnos after which the other addresses of the bus are not tried."""
 
@@ -107,7 +107,7 @@ async def _probe_address(bus: AsyncBus, address: int) -> Chip | None:
             raise
         if error.errno in NACKS or error.errno == errno.EIO:
             return None
-        busy = "in use by another program, or by a kernel driver; end or unbind it to look"
+        busy = "in use by another program or a kernel driver; end or unbind it first"
         return Chip(address, problem=busy if error.errno == errno.EBUSY else os.strerror(error.errno or 0))
 
 

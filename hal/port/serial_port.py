@@ -29,7 +29,7 @@ NOT_SERIAL = "not a serial port"
 _DRIVERS = Path("/sys/bus/usb/drivers")
 _MODULES = {"ttyACM": ("cdc_acm",), "ttyUSB": ("ftdi_sio", "cp210x", "ch341", "pl2303")}
 """Kernel modules behind device files of such names; the kernel loads them with the device where they are installed."""
-_UNPLUGGED = "plug it in again, or check its cable and power; it is reopened by itself"
+_UNPLUGGED = "connect it again, and check its cable and power; the daemon reopens it automatically"
 
 
 class SerialPort:
@@ -71,7 +71,11 @@ class SerialPort:
         except OSError as error:
             raise DeviceMissing(self._name, f"write failed: {os.strerror(error.errno or 0)}", _UNPLUGGED) from error
         if sent != len(data):
-            raise DeviceFault(self._name, f"took {sent} of {len(data)} command bytes", "the line is blocked: replug it")
+            raise DeviceFault(
+                self._name,
+                f"accepted {sent} of {len(data)} command bytes",
+                "the line is blocked; disconnect and connect it again",
+            )
 
     def set_baud(self, baud: int) -> None:
         """Change the line rate in bit/s; raises `DeviceRefused` for a rate that the adapter does not support."""
@@ -79,8 +83,8 @@ class SerialPort:
             self._line.baudrate = baud
         except (ValueError, OSError, termios.error) as error:
             if _errno_of(error) in _GONE:
-                raise DeviceMissing(self._name, "the port is gone", _UNPLUGGED) from error
-            raise DeviceRefused(self._name, f"cannot do {baud} bit/s", "choose another line rate") from error
+                raise DeviceMissing(self._name, "the port was removed", _UNPLUGGED) from error
+            raise DeviceRefused(self._name, f"does not support {baud} bit/s", "choose another line rate") from error
 
     def close(self) -> None:
         """Close without waiting for unsent bytes (a plain close of a wedged line blocks for up to 30 s)."""
@@ -103,7 +107,7 @@ class SerialPort:
             self._hung_up(f"read failed: {os.strerror(error.errno or 0)}")
             return
         if not data:
-            self._hung_up("unplugged (the line hung up)")
+            self._hung_up("unplugged (the line has closed)")
         elif self._on_data is not None:
             self._on_data(data, t_rx)
 
@@ -175,24 +179,24 @@ def explain_open_error(device: str, baud: int, error: BaseException, style: str 
     number = _errno_of(error)
     path = Path(device)
     if number == errno.ENOENT:
-        remedy = f"plug the sensor in, or look for it with: lumiloop probe{_not_loaded(path)}"
+        remedy = f"connect the sensor, or find it with: lumiloop probe{_not_loaded(path)}"
         return DeviceMissing(device, "no such device", remedy)
     if number in _GONE:
-        return DeviceMissing(device, os.strerror(number), "plug the sensor in; it is opened by itself once it is there")
+        return DeviceMissing(device, os.strerror(number), "connect the sensor; the daemon then opens it automatically")
     if number == errno.EPERM:
         return DeviceRefused(device, *KEPT_AWAY)
     if number == errno.EACCES:
         return DeviceRefused(device, "permission denied", f"add the user to group {_group_of(path)} and log in again")
     if number in (errno.EBUSY, errno.EAGAIN):
-        return DeviceRefused(device, "in use by another program", f"find it with: fuser -v {device}")
+        return DeviceRefused(device, "in use by another program", f"find that program with: fuser -v {device}")
     if number == errno.EINVAL and style != "8N1" and _is_character_device(path):
-        remedy = "name another behind the line rate; a pseudo-terminal takes 8N1 alone"
-        return DeviceRefused(device, f"does not take the character format {style}", remedy)
+        remedy = "name another format after the line rate; a pseudo-terminal supports only 8N1"
+        return DeviceRefused(device, f"does not support the character format {style}", remedy)
     if number in (errno.ENOTTY, errno.EISDIR, errno.EINVAL) or not _is_character_device(path):
-        return DeviceRefused(device, NOT_SERIAL, "name the sensor's own device file, such as /dev/ttyACM0")
+        return DeviceRefused(device, NOT_SERIAL, "name the device file of the sensor, such as /dev/ttyACM0")
     if isinstance(error, ValueError):
-        return DeviceRefused(device, f"cannot do {baud} bit/s", "choose another line rate")
-    return DeviceRefused(device, f"cannot be opened: {error}", "look into the kernel log: dmesg | tail")
+        return DeviceRefused(device, f"does not support {baud} bit/s", "choose another line rate")
+    return DeviceRefused(device, f"cannot be opened: {error}", "read the kernel log: dmesg | tail")
 
 
 def _not_loaded(path: Path) -> str:

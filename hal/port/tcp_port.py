@@ -16,7 +16,7 @@ from hal.port.port import OnData, OnLost
 
 DEFAULT_TCP_PORT: Final = 10940
 CONNECT_TIMEOUT_S: Final = 2.0
-REFUSED: Final = "is it on, and is the port right? a sensor serves one client: stop the other"
+REFUSED: Final = "check its power and the port; a sensor serves one client, so stop the other"
 _DEAD_PEER_S: Final = 3  # a pulled network cable is noticed within this time, even with nothing to send
 
 
@@ -85,7 +85,7 @@ class TcpPort(asyncio.Protocol):
         """asyncio: the connection is gone."""
         why = "closed by the sensor" if exc is None else f"lost: {exc}"
         self._lost = DeviceMissing(
-            self._name, f"connection {why}", "check its power and network cable, and that no second client uses it"
+            self._name, f"connection {why}", "check its power, its network cable, and that no second client uses it"
         )
         self._deliver_lost()
 
@@ -133,7 +133,7 @@ async def open_tcp_port(device: str, clock: Clock | None = None) -> TcpPort:
 
 def _unnamed(device: str) -> str:
     """Text that names the default port, for a device name without a port."""
-    return "" if urlsplit(device).port is not None else f" at port {DEFAULT_TCP_PORT}, as the name has none"
+    return "" if urlsplit(device).port is not None else f" at port {DEFAULT_TCP_PORT}, the default port"
 
 
 async def _resolved(device: str, host: str, number: int) -> list[inet.Address]:

@@ -59,7 +59,7 @@ def read_capture(path: Path, report: LogReport) -> list[Chunk]:
         raise DataInvalid(str(path), problem, "name a .logr file, or another kind of log")
     chunks = list(_chunks(data, report))
     if not chunks:
-        raise DataInvalid(str(path), "ends within its first record", "name another log; nothing can be played of it")
+        raise DataInvalid(str(path), "ends within its first record", "name another log; this one has no data")
     chunks = _in_time(path, chunks, report)
     report.use("chunks", len(chunks))
     report.use("bytes", sum(len(chunk.data) for chunk in chunks))
@@ -78,7 +78,7 @@ def _in_time(path: Path, chunks: list[Chunk], report: LogReport) -> list[Chunk]:
         raise DataInvalid(str(path), f"all {len(chunks)} times in it are equal", "capture the line with its times")
     if not (clock.backward or clock.restarts or clock.wild or clock.coarse_s):
         return chunks
-    report.notes.append("the host's clock was set, or is coarse: its steps are bridged or spread")
+    report.notes.append("the host's clock was set or is coarse; its steps are removed or spread")
     return [Chunk(round(1e6 * t), chunk.data) for t, chunk in zip(clock.time.tolist(), chunks, strict=True)]
 
 
@@ -86,7 +86,7 @@ def _chunks(data: bytes, report: LogReport) -> Iterator[Chunk]:
     at = 0
     while at < len(data):
         if not looks_like_capture(data[at : at + _HEAD.size]):
-            report.skip(at, "the capture goes on with bytes that are no record; they are left out")
+            report.skip(at, "the capture ends with bytes that are not a record; they are skipped")
             return
         t_us, length = _HEAD.unpack_from(data, at)
         chunk = data[at + _HEAD.size : at + _HEAD.size + length]

@@ -31,8 +31,8 @@ Array = npt.NDArray[np.float64]
 
 _GIVE_UP_LINES: Final = 1000
 _NO_ODOMETRY: Final = (np.empty(0), np.empty((0, 3)))
-_NO_TIME: Final = "name a log with the time of every scan in seconds, as the logger wrote it (UNIX time)"
-_REMEDY: Final = "name a log with laser lines, or make one with `lumiloop convert IN OUT`"
+_NO_TIME: Final = "name a log with the UNIX time of every scan in seconds"
+_REMEDY: Final = "name a log with scans, or make one with `lumiloop convert IN OUT`"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,13 +120,13 @@ def read_carmen(path: Path) -> CarmenLog:
     parsed = _parse_all(path, report)
     lasers = _usable(parsed.lasers, report)
     if not lasers:
-        raise DataInvalid(str(path), "holds no usable laser line", _first_reasons(report))
+        raise DataInvalid(str(path), "has no usable scan line", _first_reasons(report))
     lasers = _ordered(lasers, report)
     stamps = np.array([line.stamp for line in lasers])
     origin = float(stamps[0])
     clock = monotone(stamps, origin)
     if clock.refusal:
-        raise DataInvalid(str(path), f"its stamps give no time to play it at: {clock.refusal}", _NO_TIME)
+        raise DataInvalid(str(path), f"its stamps cannot be used as times: {clock.refusal}", _NO_TIME)
     _note_stamps(clock, report)
     separate = _separate_odometry(parsed.odometry, origin, report)
     return CarmenLog(
@@ -177,7 +177,7 @@ def _note_file(path: Path, number: int, torn: Torn, parsed: _Parsed, report: Log
         what = torn.reason or "the file is empty"
         raise DataInvalid(str(path), what, "record or download the log again")
     if torn.reason:
-        report.notes.append(f"{torn.reason} after line {number}; what was read is used")
+        report.notes.append(f"{torn.reason} after line {number}; the part before it is used")
     if not parsed.lasers and not parsed.odometry:
         raise DataInvalid(
             f"{path}:{number}", "not a CARMEN log: no FLASER, ROBOTLASER1 or RAWLASER1 line up to here", _REMEDY
@@ -197,10 +197,10 @@ def _usable(lasers: list[LaserLine], report: LogReport) -> list[LaserLine]:
             used.append(line)
         else:
             report.skip(
-                index + 1, f"{line.setup.count} beams where the log's laser has {usual} (numbers count laser lines)"
+                index + 1, f"{line.setup.count} beams, but the lidar of the log has {usual} (numbers count scan lines)"
             )
     if used and not beam_geometry(used[0].setup)[2]:
-        report.notes.append(f"the log does not say where its {usual} beams point: 180 deg from -90 deg is assumed")
+        report.notes.append(f"the log has no bearings for its {usual} beams; the replay assumes 180 deg from -90 deg")
     return used
 
 
@@ -218,7 +218,7 @@ def _ordered(lasers: list[LaserLine], report: LogReport) -> list[LaserLine]:
     if not _path(poses[order]) < _path(poses):
         return lasers
     moved = np.count_nonzero(away)
-    report.notes.append(f"{moved} scans are out of order: put in the order of their stamps, which the wheels fit")
+    report.notes.append(f"{moved} scans are out of order; they are sorted by their stamps, which fit odometry")
     return [lasers[k] for k in order.tolist()]
 
 
@@ -231,19 +231,20 @@ def _path(poses: Array) -> float:
 def _note_stamps(clock: Monotone, report: LogReport) -> None:
     if clock.backward:
         report.notes.append(
-            f"stamps run backwards {clock.backward} times, by {clock.worst_s:.3f} s at most: file order is kept"
+            f"stamps run backwards {clock.backward} times, by {clock.worst_s:.3f} s at most; the order of the "
+            "file is kept"
         )
     if clock.wild:
-        report.notes.append(f"{clock.wild} single stamps are far from both neighbours: taken from these")
+        report.notes.append(f"{clock.wild} single stamps are far from both neighbours; they are interpolated")
     if clock.coarse_s:
         report.notes.append(
-            f"the log's clock steps by {clock.coarse_s:.3g} s, and {clock.duplicates} stamps equal the one before: "
-            "spread evenly over each step"
+            f"the log's clock steps by {clock.coarse_s:.3g} s, and {clock.duplicates} stamps equal the one "
+            "before; they are spread evenly over each step"
         )
     elif clock.duplicates:
-        report.notes.append(f"{clock.duplicates} stamps equal the one before: spread in time")
+        report.notes.append(f"{clock.duplicates} stamps equal the one before; they are spread in time")
     if clock.restarts:
-        report.notes.append(f"the log's clock restarted or was set {clock.restarts} times: bridged")
+        report.notes.append(f"the log's clock restarted or was set {clock.restarts} times; the steps are removed")
 
 
 def _separate_odometry(readings: list[OdometryLine], origin: float, report: LogReport) -> tuple[Array, Array]:
@@ -252,7 +253,7 @@ def _separate_odometry(readings: list[OdometryLine], origin: float, report: LogR
         return _NO_ODOMETRY
     clock = monotone(np.array([reading.stamp for reading in readings]), origin)
     if len(readings) > 1 and clock.duplicates == len(readings) - 1:
-        report.notes.append("all ODOM lines have one stamp: not used")
+        report.notes.append("all ODOM lines have one stamp and are not used")
         return _NO_ODOMETRY
     return clock.time, np.array([reading.pose for reading in readings])
 
@@ -265,7 +266,7 @@ def _odometry(
     poses = np.array([line.robot for line in lasers if line.robot is not None]).reshape(-1, 3)
     if _moves(poses):
         if not posed.all():
-            report.notes.append(f"{np.count_nonzero(~posed)} laser lines carry no usable robot pose")
+            report.notes.append(f"{np.count_nonzero(~posed)} scan lines have no usable robot pose")
         return time[posed], poses
     if _moves(separate[1]):
         return separate

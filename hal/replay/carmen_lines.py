@@ -122,7 +122,7 @@ def _count(word: bytes) -> int:
 def _stamp(words: list[bytes], at: int) -> float:
     """The ipc time; host and logger's time must end the line after it, else lines were cut or joined."""
     if len(words) != at + _TAIL:
-        raise ValueError(f"{len(words)} fields where {at + _TAIL} belong")
+        raise ValueError(f"{len(words)} fields instead of {at + _TAIL}")
     stamp = float(words[at])
     if not math.isfinite(stamp):
         raise ValueError("the time stamp is not a number")

@@ -88,9 +88,9 @@ class Monotone:
         if self.restarts > max(2.0, CLOCK_CHANGES * count):
             return f"the clock jumps at {self.restarts} of {count} stamps"
         if usual < FASTEST_S:
-            return f"too few stamps lie later than the one before: {self.duplicates} equal it, {self.backward} run back"
+            return f"too few stamps are later than the one before: {self.duplicates} equal it, {self.backward} run back"
         if usual > SLOWEST_S:
-            return f"the stamps lie {usual:.0f} s apart, and are no seconds"
+            return f"the stamps lie {usual:.0f} s apart and cannot be seconds"
         return ""
 
 

@@ -36,15 +36,15 @@ def log_mount(lasers: list[LaserLine], parameters: dict[str, str], report: LogRe
     off = _outliers(measured, middle)
     if off.mean() > 1.0 - _MOST:
         report.notes.append(
-            f"laser and robot pose differ by no constant mount on {int(off.sum())} of {len(off)} lines: "
-            f"mount {'from the parameters' if stated else 'taken as zero; set lidar.mount if it is not'}"
+            f"lidar and robot pose have no constant offset on {int(off.sum())} of {len(off)} lines: mount "
+            f"{'from the parameters' if stated else 'taken as zero; set lidar.mount if it is not'}"
         )
         return stated or (0.0, 0.0, 0.0)
     if off.any():
-        report.notes.append(f"laser and robot pose disagree with the mount on {int(off.sum())} of {len(off)} lines")
+        report.notes.append(f"lidar and robot pose disagree with the mount on {int(off.sum())} of {len(off)} lines")
     mount = _tidy(middle)
     if stated is not None and bool(_outliers(np.array([stated]), middle)[0]):
-        report.notes.append(f"mount by the poses {mount}, by the parameters {stated}: the poses count")
+        report.notes.append(f"mount by the poses {mount}, by the parameters {stated}; the poses are used")
     return mount
 
 

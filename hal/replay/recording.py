@@ -215,13 +215,13 @@ class Recording:
             data = _load(path)
             header, at = _read_head(data)
             if header is None:
-                report.notes.append(f"{path.name}: the head is damaged, the segment is left out ({len(data)} bytes)")
+                report.notes.append(f"{path.name}: the head is damaged, and the segment is skipped ({len(data)} bytes)")
                 continue
             if header.get("recording") != self.header.get("recording"):
-                report.notes.append(f"{path.name}: belongs to another recording, left out")
+                report.notes.append(f"{path.name}: the segment belongs to another recording and is skipped")
                 continue
             if header.get("segment") != number + 1:
-                report.notes.append(f"{path.name}: the segment before it is missing")
+                report.notes.append(f"{path.name}: the previous segment is missing")
             number = int(header.get("segment", number))
             yield from _frames(path.name, data, at, report)
 

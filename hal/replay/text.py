@@ -31,7 +31,7 @@ def unreadable(path: Path, error: OSError) -> HalError:
     if error.errno == errno.EISDIR:
         return DeviceRefused(str(path), "is a folder", "name the log file inside it")
     if error.errno in (errno.EACCES, errno.EPERM):
-        return DeviceRefused(str(path), "may not be read by this user", f"run it with sudo, or: chmod a+rX {path}")
+        return DeviceRefused(str(path), "cannot be read by this user", f"run this with sudo, or run: chmod a+rX {path}")
     return DeviceRefused(str(path), f"cannot be read: {error.strerror or error}", "check the disk and the path")
 
 
@@ -86,6 +86,6 @@ def _chunks(path: Path, torn: Torn, size: int) -> Iterator[bytes]:
                 while chunk := read(size):
                     yield chunk
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        torn.reason = f"the compressed file breaks off ({error})"
+        torn.reason = f"the compressed file is incomplete ({error})"
     except OSError as error:
         raise unreadable(path, error) from error

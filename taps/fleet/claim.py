@@ -111,8 +111,9 @@ class Claim:
         if not mine:
             self._reported = False
             self._report(
-                f"the fleet has a robot {self._robot} already, on {messages.host_of(self._before())}; this one, on "
-                f"{self._host}, tells nothing until that one has gone: give one of them another `name`"
+                f"the fleet has a robot {self._robot} already, on {messages.host_of(self._before())}; this "
+                f"one, on {self._host}, publishes nothing until that one has left. Give one of them another "
+                "`name`"
             )
         self._on_change(mine)
 

@@ -123,7 +123,7 @@ def picture(chart: Chart, members: Sequence[Member]) -> tuple[npt.NDArray[np.uin
     legend = []
     for k, member, row, column in on_chart(chart, members):
         name, colour = COLOURS[k % len(COLOURS)]
-        legend.append(f"{printable(member.name)} {name}" + ("" if member.localised else " (where it was last)"))
+        legend.append(f"{printable(member.name)} {name}" + ("" if member.localised else " (last received pose)"))
         _disc(pixels, scale * row, scale * column, colour)
         assert member.place is not None
         nose = 1.6 * DISC_PX * np.array((math.sin(member.place[2]), math.cos(member.place[2])))

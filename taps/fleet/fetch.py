@@ -124,7 +124,7 @@ class Fetcher:
         offer = newest_offer(kind, await self._offers(session, kind), taken)
         if offer is None:
             assert taken is not None
-            result = f"{kind} version {taken.version} is here already"
+            result = f"{kind} version {taken.version} is installed already"
             if kind == MAP and modbus is not None and not taken.switched:
                 result = f"{result}; {await self._switch(modbus, taken)}"
             return result
@@ -132,7 +132,7 @@ class Fetcher:
         try:
             taken = self._records.note(offer, where)
         except OSError as error:
-            raise Refused(f"{self._records.path}: {reason_of(error)}; {where} is in place all the same") from None
+            raise Refused(f"{self._records.path}: {reason_of(error)}; {where} is installed nevertheless") from None
         if kind == MAP and modbus is not None:
             try:
                 note = await self._switch(modbus, taken)
@@ -150,8 +150,8 @@ class Fetcher:
         try:
             self._records.switched(taken)
         except OSError as error:
-            raise Refused(f"{self._records.path}: {reason_of(error)}; the daemon goes on in it all the same") from None
-        return "the daemon goes on in it"
+            raise Refused(f"{self._records.path}: {reason_of(error)}; the daemon uses the map nevertheless") from None
+        return "the daemon uses the map now"
 
     async def _offers(self, session: zenoh.Session, kind: str) -> list[Offer]:
         """The present offers; tried again for a sharing host that is reconnecting."""
@@ -161,7 +161,7 @@ class Fetcher:
                 try:
                     offers.append(messages.read(content, Offer))
                 except Unreadable as error:
-                    console.say(printable(f"what is offered as {kind} is not one: {error}"))
+                    console.say(printable(f"the shared {kind} is not valid: {error}"))
             if offers or not left:
                 break
             await asyncio.sleep(PAUSE_S)
@@ -175,7 +175,7 @@ class Fetcher:
                     return content
             if found:
                 return found[0][1]  # refused later, with the reason
-        raise Refused(f"{offer.label()}: is announced, and does not come; is the connection to who shares it broken?")
+        raise Refused(f"{offer.label()}: the content does not arrive; check the connection to the robot that shares it")
 
 
 async def switched(name: str, modbus: tuple[str, int], map_id: int) -> None:
@@ -187,6 +187,6 @@ async def switched(name: str, modbus: tuple[str, int], map_id: int) -> None:
     try:
         outcome = await switch_map(name, *modbus, map_id)
     except CommandRefused as error:
-        raise Refused(f"the daemon could not be asked to go on in it: {error}") from None
+        raise Refused(f"the daemon could not be commanded to use the map: {error}") from None
     if outcome != "done":
-        raise Refused(f"the daemon was asked to go on in it: {outcome}; its log says why")
+        raise Refused(f"the daemon did not switch to the map: {outcome}; its log gives the cause")

@@ -180,7 +180,7 @@ def read_map(content: bytes, attachment: bytes) -> tuple[MapHead, Cells]:
     except zlib.error as error:
         raise Unreadable(f"a map that cannot be inflated ({error})") from None
     if len(cells) != head.columns * head.rows:
-        raise Unreadable(f"a map of {len(cells)} cells that should have {head.columns * head.rows}")
+        raise Unreadable(f"a map of {len(cells)} cells instead of {head.columns * head.rows}")
     return head, np.frombuffer(cells, np.int8).reshape(head.rows, head.columns)
 
 
@@ -191,14 +191,14 @@ def read(data: bytes, kind: type[Message]) -> Message:
         Unreadable: not a message of that kind, or of another schema.
     """
     if len(data) > LONGEST:
-        raise Unreadable(f"a message of {len(data)} bytes, and none has more than {LONGEST}")
+        raise Unreadable(f"the message has {len(data)} bytes; the limit is {LONGEST}")
     try:
         message = msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise Unreadable(f"no message of a lumiloop ({error})") from None
+        raise Unreadable(f"not a lumiloop message ({error})") from None
     schema = getattr(message, "schema", SCHEMA)
     if schema != SCHEMA:
-        raise Unreadable(f"schema {schema}, and this program knows {SCHEMA}: install both from the same release")
+        raise Unreadable(f"schema {schema}, but this program has {SCHEMA}; install both from the same release")
     return message
 
 

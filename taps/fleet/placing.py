@@ -114,7 +114,9 @@ def survey_in(content: bytes, name: str, profile: Profile | None = None) -> Surv
             except SurveyError as error:
                 raise Refused(str(error).replace(str(path), name)) from None
     except OSError as error:
-        raise Refused(f"{name}: cannot be checked, for want of a temporary file: {reason_of(error)}") from None
+        raise Refused(
+            f"{name}: cannot be checked, because no temporary file can be written: {reason_of(error)}"
+        ) from None
 
 
 class Installed(Held, frozen=True):
@@ -187,20 +189,20 @@ def newest_offer(kind: str, offers: list[Offer], held: Held | None) -> Offer | N
     """
     fitting = [offer for offer in offers if offer.kind == kind]
     if not fitting:
-        raise Refused(f"nobody shares a {kind}: `lumiloop fleet share --{kind} FILE` does")
+        raise Refused(f"no robot shares a {kind}; share one with `lumiloop fleet share --{kind} FILE`")
     newest = max(fitting, key=lambda offer: offer.version)
     contents = {offer.sha256 for offer in fitting if offer.version == newest.version}
     if held is not None and held.version == newest.version:
         contents.add(held.sha256)
     if len(contents) > 1:
         raise Refused(
-            f"{kind} version {newest.version} is there with {len(contents)} different contents; share the right one "
-            f"with --version {newest.version + 1}"
+            f"{kind} version {newest.version} exists with {len(contents)} different contents; share the right "
+            f"one with --version {newest.version + 1}"
         )
     if held is not None and held.version > newest.version:
         raise Refused(
-            f"{newest.label()} is older than version {held.version}, which is here; to go back to it, share it with "
-            f"--version {held.version + 1}"
+            f"{newest.label()} is older than version {held.version}, which is installed; to use it again, "
+            f"share it with --version {held.version + 1}"
         )
     return None if held is not None and held.version == newest.version else newest
 
@@ -213,8 +215,8 @@ def check(offer: Offer, content: bytes) -> None:
     """
     if len(content) != offer.size or sha256_of(content) != offer.sha256:
         raise Refused(
-            f"{offer.label()}: what came ({len(content)} bytes) is not what was announced ({offer.size} bytes, SHA-256 "
-            f"{offer.sha256[:12]}...); nothing is changed"
+            f"{offer.label()}: the content ({len(content)} bytes) differs from the announced one "
+            f"({offer.size} bytes, SHA-256 {offer.sha256[:12]}...); nothing is changed"
         )
 
 
@@ -228,7 +230,7 @@ def install(offer: Offer, content: bytes, settings: Config, survey: Path | None)
     if offer.kind == MAP:
         map_id = map_id_of(content, offer.name)
         if map_id != offer.map_id:
-            raise Refused(f"{offer.label()}: holds map {map_id:08x}, not {offer.map_id:08x} as announced")
+            raise Refused(f"{offer.label()}: contains map {map_id:08x}, not {offer.map_id:08x} as announced")
         return place_map(content, map_id, settings)
     where = target_path(SURVEY, settings, survey)
     profile = PROFILES[settings.photodiode.profile]
@@ -243,10 +245,10 @@ def target_path(kind: str, settings: Config, survey: Path | None) -> Path:
     """
     if kind == MAP:
         if not settings.map.kept:
-            raise Refused("maps are not kept: `map.folder` is none")
+            raise Refused("maps are not stored, because `map.folder` is none")
         return stored_maps(settings.map.folder).absolute()
     if survey is None and not settings.lights.survey:
-        raise Refused("where should the survey go? set `lights.survey`, or name a file with --survey FILE")
+        raise Refused("no file for the survey is known; set `lights.survey`, or name a file with --survey FILE")
     return (survey or Path(settings.lights.survey)).absolute()
 
 
@@ -254,7 +256,7 @@ def place_map(content: bytes, map_id: int, settings: Config) -> tuple[Path, str]
     """Install a map as the newest generation in the folder of maps, for the next start."""
     store = Store(target_path(MAP, settings, None), mend=False)
     try:
-        return keep(settings, content, map_id), "the next start goes on in it"
+        return keep(settings, content, map_id), "the next start uses it"
     except BadMap as error:
         raise Refused(f"{store.folder}: {error}") from None
     except OSError as error:
@@ -273,14 +275,14 @@ def _place_beside_daemon(store: Store, content: bytes, map_id: int) -> tuple[Pat
         generations = store.generations()
         if any(one.map_id == map_id for one in generations):
             raise Refused(
-                f"{store.folder}: a running daemon keeps map {map_id:08x} there itself; stop it, and try again"
+                f"{store.folder}: a running daemon keeps map {map_id:08x} there; stop the daemon and try again"
             )
         number = 1 + max((one.number for one in generations), default=0)
         path = store.folder / f"map-{map_id:08x}-{number:08d}.lumimap"
         write_whole(path, content)
     except OSError as error:
         raise Refused(f"{store.folder}: {reason_of(error)}") from None
-    return path, "the daemon that runs goes on in its own map: --switch asks it to change"
+    return path, "the running daemon keeps its map; use --switch to change it"
 
 
 def place_survey(shared: Survey, where: Path) -> tuple[Path, str]:
@@ -289,20 +291,20 @@ def place_survey(shared: Survey, where: Path) -> tuple[Path, str]:
     Raises:
         Refused: the file cannot be written, or the present one cannot be read.
     """
-    words = "its receiver is the shared file's: look at [receiver]"
+    words = "its receiver comes from the shared file; check [receiver]"
     try:
         if where.exists():
             own, old = read_survey(where), where.read_bytes()
             shared = replace(shared, receiver=own.receiver)
             backup = _backup_path(where, old)
-            words = f"[receiver] is this robot's own as before; the old file is {backup.name}"
+            words = f"[receiver] of this robot is unchanged; the old file is {backup.name}"
             write_whole(backup, old)
         write_whole(where, dump(shared, ("Lamps as shared in the fleet.",)).encode())
     except SurveyError as error:
-        raise Refused(f"{error}; mend it, or move it away") from None
+        raise Refused(f"{error}; correct it, or move the file away") from None
     except OSError as error:
         raise Refused(f"{where}: cannot be written: {reason_of(error)}") from None
-    return where, f"the daemon takes it at its next start; {words}"
+    return where, f"the daemon uses it at its next start; {words}"
 
 
 def _backup_path(where: Path, old: bytes) -> Path:

@@ -200,7 +200,7 @@ class Robot:
 
     def _state(self, hangs: bool) -> StateMessage:
         if self._pose is None or hangs:
-            meaning = "the daemon does not answer" if self._pose is None else "the daemon stands"
+            meaning = "the daemon does not answer" if self._pose is None else "the daemon does not respond"
             return StateMessage(
                 t_utc=time.time(), up=False, state_name="DOWN", meaning=meaning, held=self._records.held()
             )

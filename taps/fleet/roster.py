@@ -174,8 +174,8 @@ class Roster:
             hosts = [messages.host_of(one) for one in sorted(member.publishers | member.waiting)]
             if len(hosts) > 1:
                 found.append(
-                    f"{member.name}: {len(hosts)} robots have this name, on {', '.join(hosts)}; the first one is "
-                    "shown: give each a `name` of its own"
+                    f"{member.name}: {len(hosts)} robots have this name, on {', '.join(hosts)}; only the "
+                    "first one is shown, so give each its own `name`"
                 )
             if member.problem:
                 found.append(f"{member.name}: {member.problem}")
@@ -187,9 +187,11 @@ class Roster:
             }
             newest = max(versions.values(), default=0)
             if behind := [name for name, version in versions.items() if version < newest]:
-                found.append(f"{', '.join(behind)}: not the newest {kind}, {newest}: `lumiloop fleet fetch` there")
+                found.append(
+                    f"{', '.join(behind)}: the newest {kind}, {newest}, is missing; run `lumiloop fleet fetch` there"
+                )
         if self._full:
-            found.append(f"more than {MOST_ROBOTS} robots are there: those that came later are not shown")
+            found.append(f"more than {MOST_ROBOTS} robots are in the fleet; later ones are not shown")
         return [printable(line) for line in found]
 
     def chart(self) -> Chart | None:
@@ -213,7 +215,7 @@ class Roster:
         """
         others = sum(len(one.map.content) for one in self.members.values() if one.map is not None and one is not member)
         if others + len(content) > MOST_MAPS:
-            raise Unreadable(f"no room for its {len(content)} bytes: all robots' maps together have {MOST_MAPS}")
+            raise Unreadable(f"its map has {len(content)} bytes; the limit of all maps together is {MOST_MAPS}")
         head, cells = messages.read_map(content, attachment)
         member.map = MapKept(head, content, attachment, int((cells != UNSEEN).sum()))
 

@@ -20,7 +20,7 @@ def main(args: argparse.Namespace) -> int:
     """Share until stopped; returns the exit code."""
     requested = [(kind, path) for kind, path in ((SURVEY, args.survey), (MAP, args.map)) if path is not None]
     if not requested:
-        return console.fail("say what to share: --survey FILE, --map FILE", console.USAGE)
+        return console.fail("nothing to share is named; give --survey FILE or --map FILE", console.USAGE)
     try:
         offers = [offer_of(kind, path, args.version) for kind, path in requested]
         asyncio.run(run_until_stopped(share(args, offers)))
@@ -75,6 +75,6 @@ def router(args: argparse.Namespace) -> int:
         return console.fail(str(error), console.USAGE)
     except zenoh.ZError as error:
         return console.fail(
-            f"cannot listen on {args.listen}: {error_text(error)}; free it, or name another with --listen"
+            f"cannot listen on {args.listen}: {error_text(error)}; free the address, or name another with --listen"
         )
     return console.OK

@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
         return console.fail(str(error))
     except OSError as error:
         return console.fail(f"{args.picture}: {reason_of(error)}; name another file")
-    return console.OK if roster.members else console.fail(f"no robot tells anything by way of {args.router}")
+    return console.OK if roster.members else console.fail(f"no robot publishes through {args.router}")
 
 
 async def show(args: argparse.Namespace, roster: Roster) -> None:
@@ -68,8 +68,8 @@ async def show(args: argparse.Namespace, roster: Roster) -> None:
                 session = await stack.enter_async_context(open_session(args.router, args.zenoh))
         except TimeoutError:
             raise NoRouter(
-                f"no router answers at {args.router} within {ROUTER_S:g} s: "
-                "start one (`lumiloop fleet router`), or name it (--router)"
+                f"no router answers at {args.router} within {ROUTER_S:g} s; start one with `lumiloop fleet "
+                "router`, or name it with --router"
             ) from None
         collector = Collector(session, roster)
         watching = asyncio.create_task(watch_router(session, args.router, collector.on_router))
@@ -170,6 +170,6 @@ def render(args: argparse.Namespace, roster: Roster, present: bool) -> str:
             write_whole(args.picture, encode_png(pixels))
             lines.append(f"{args.picture}: {', '.join(legend) or 'no robot is in that map'}")
     elif args.picture is not None:
-        lines.append(f"{args.picture}: not written, no robot has told a map yet")
-    lines += [] if present else [f"the router at {args.router} has gone: this is what was told last"]
+        lines.append(f"{args.picture}: not written, because no robot has published a map yet")
+    lines += [] if present else [f"the router at {args.router} is gone; these are the last received data"]
     return "\n".join([*lines, *roster.problems()]) + "\n"

@@ -49,16 +49,16 @@ def check(head: bytes, guard: Guard, origins: Sequence[str]) -> None:
     """
     first, *lines = head.decode("latin-1").split("\r\n")
     if not first.startswith("GET ") or " HTTP/1." not in first:
-        raise Refused("400 Bad Request", "not a request of HTTP/1")
+        raise Refused("400 Bad Request", "not an HTTP/1 request")
     fields = [line.partition(":") for line in lines if line]
     hosts = [value.strip() for name, _, value in fields if name.lower() == "host"]
     named = [value.strip() for name, _, value in fields if name.lower() == "origin"]
     if any(not name or name != name.strip() for name, _, _ in fields) or len(hosts) != 1 or len(named) > 1:
-        raise Refused("400 Bad Request", "one Host and at most one Origin are needed")
+        raise Refused("400 Bad Request", "the request needs one Host and at most one Origin")
     if not guard.host_ok(hosts[0]):
-        raise Refused("421 Misdirected Request", "this computer is asked under a name that is not its own")
+        raise Refused("421 Misdirected Request", "the request names another host; use this computer's address")
     if named and named[0].lower() not in origins and not guard.origin_ok(named[0], hosts[0]):
-        raise Refused("403 Forbidden", f"pages of {named[0][:100]} may not watch; --origin permits it")
+        raise Refused("403 Forbidden", f"pages of {named[0][:100]} have no access; --origin permits it")
 
 
 class Gate:
@@ -94,7 +94,7 @@ class Gate:
         except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
             pass
         except Exception as error:  # noqa: BLE001  any failure ends this connection alone
-            log_once(log, self._defects, error, "a connection cannot be served; it is closed")
+            log_once(log, self._defects, error, "serving a connection has failed; it is closed")
         finally:
             self._peers.remove(peer)
             self._tasks.discard(task)

@@ -43,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
         return console.fail(str(error))
     except OSError as error:
         why = error.strerror or error
-        return console.fail(f"cannot listen on {args.listen}: {why}; free it, or name another with --listen")
+        return console.fail(f"cannot listen on {args.listen}: {why}; free the address, or name another with --listen")
     finally:
         bridge.close()
     return console.OK

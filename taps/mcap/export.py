@@ -63,8 +63,8 @@ def _save(args: argparse.Namespace) -> int:
     from taps.mcap.recover import NotMcap, recover
 
     if args.tum or args.kitti:
-        problem = f"{args.log} is an MCAP file: only --mcap can be made of it, with all that is whole"
-        return console.fail(f"{problem}; trajectories are made of the recording itself", console.USAGE)
+        problem = f"{args.log} is an MCAP file; only --mcap is possible, which recovers its complete messages"
+        return console.fail(f"{problem}; make trajectories from the recording itself", console.USAGE)
     _check_outputs((args.log,), args)
     try:
         found = recover(args.log, args.mcap)
@@ -94,7 +94,7 @@ def _export(args: argparse.Namespace) -> int:
         console.say(f"{args.mcap}: {file.messages} messages")
     final = (source.rerun.ledger.online() if args.online else source.rerun.ledger.final()).ordered()
     guesses = sum(map(bool, final.guesses()))
-    guessed = f", and {guesses} guesses that are none" if guesses else ""
+    guessed = f", and {guesses} unconfirmed poses that are omitted" if guesses else ""
     for path, text in ((args.tum, tum), (args.kitti, kitti)):
         if path is not None:
             write_whole(path, text(final))
@@ -105,11 +105,12 @@ def _export(args: argparse.Namespace) -> int:
     if source.rerun.comparison.differ:
         count, first = source.rerun.comparison.differ, source.rerun.comparison.first
         console.say(
-            f"the replay is not the recorded run in {count} cycles: other software, or records lost; first {first}"
+            f"the replay differs from the recorded run in {count} cycles: the software differs, or records "
+            f"are lost; first {first}"
         )
     if sentence := doubt(source.rerun.ledger.online()):
         console.say(f"{args.log}: {sentence}")
-    return console.fail(f"{stopped}; what was read until then is written") if stopped else console.OK
+    return console.fail(f"{stopped}; the part before it is written") if stopped else console.OK
 
 
 def _check_outputs(read: Iterable[Path], args: argparse.Namespace) -> None:
@@ -118,20 +119,18 @@ def _check_outputs(read: Iterable[Path], args: argparse.Namespace) -> None:
     Raises:
         OutputConflict: naming the option.
     """
-    taken = {path.resolve(): "the file that is read" for path in read}
+    taken = {path.resolve(): "the input file" for path in read}
     for option in ("mcap", "tum", "kitti"):
         target: Path | None = getattr(args, option)
         if target is None:
             continue
         if target.resolve() in taken:
-            raise OutputConflict(f"--{option} {target}: is {taken[target.resolve()]}; name another one")
+            raise OutputConflict(f"--{option} {target}: this is {taken[target.resolve()]}; name another file")
         if not target.parent.is_dir():
-            raise OutputConflict(
-                f"--{option} {target}: there is no folder {target.parent}; make it, or name another file"
-            )
+            raise OutputConflict(f"--{option} {target}: no folder {target.parent}; create it, or name another file")
         if option == "mcap" and target.exists() and not args.force:  # it may be the only copy of a live recording
-            raise OutputConflict(f"--mcap {target} is there already; name another file, or replace it with --force")
-        taken[target.resolve()] = f"what --{option} writes, too"
+            raise OutputConflict(f"--mcap {target} exists already; name another file, or replace it with --force")
+        taken[target.resolve()] = f"also the output of --{option}"
 
 
 @contextmanager

@@ -26,13 +26,9 @@ TOPICS: Final = ("pose", "lights", "scan", "state", "loop", "faults", "statistic
 def main(args: argparse.Namespace) -> int:
     """The command's body; returns the exit code."""
     if args.out.exists() and not args.force:
-        return console.fail(
-            f"{args.out} is there already; name another file, or replace it with --force", console.USAGE
-        )
+        return console.fail(f"{args.out} exists already; name another file, or replace it with --force", console.USAGE)
     if not args.out.parent.is_dir():
-        return console.fail(
-            f"{args.out}: there is no folder {args.out.parent}; make it, or name another file", console.USAGE
-        )
+        return console.fail(f"{args.out}: no folder {args.out.parent}; create it, or name another file", console.USAGE)
     stream = Stream(args.stream or args.settings.name, (*TOPICS, *(["raw"] if args.raw else [])))
     file = None
     try:
@@ -41,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
     except NotTheStream as error:
         return console.fail(str(error))
     except NoRoom as error:
-        whole = "the file is whole up to here; " if file is not None and file.messages else ""
+        whole = "the file is complete up to here; " if file is not None and file.messages else ""
         return console.fail(f"{args.out}: stopped, {error}: {whole}free space, or name another disk")
     except OSError as error:
         return console.fail(f"{args.out}: {error.strerror}; free space or name another file")
@@ -49,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
         if file is not None and not file.messages:
             _remove_if_file(args.out)
     if not file.messages:
-        return console.fail("nothing was told, and no file is left; is the daemon running?")
+        return console.fail("no data were received, so no file was written; check that the daemon runs")
     console.say(f"{args.out}: {file.messages} messages")
     return console.OK
 
@@ -77,7 +73,7 @@ async def record(stream: Stream, settings: Config, file: McapFile) -> None:
                 if isinstance(frame, Lost):
                     console.say(f"{frame.text}; waiting")
                 elif isinstance(frame, Hello):
-                    console.say(f"recording {frame.name} into {file.path}")
+                    console.say(f"recording {frame.name} to {file.path}")
                     translator.restart()
                 else:
                     for out in translator.convert(frame):

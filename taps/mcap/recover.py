@@ -22,7 +22,7 @@ LONGEST: Final = 256 << 20
 """Most bytes of a record; a longer one is damage."""
 
 
-CUT: Final = "its writer still writes or was killed, or the disk was full"
+CUT: Final = "its writer still runs or was killed, or the disk was full"
 """Possible causes of a file without an end."""
 
 
@@ -42,7 +42,7 @@ class Recovered:
     def sentence(self) -> str:
         """The result as text."""
         span = (self.last_ns - self.first_ns) * 1e-9
-        ended = "the file was whole" if not self.torn else f"the file ends there: {self.torn}"
+        ended = "the file was complete" if not self.torn else f"the file ends there: {self.torn}"
         return f"{self.messages} messages over {span:.1f} s; {ended}"
 
 
@@ -56,7 +56,7 @@ def recover(source: Path, target: Path) -> Recovered:
     found = Recovered()
     with source.open("rb") as data:
         if data.read(len(MAGIC)) != MAGIC:
-            raise NotMcap(f"{source} is no MCAP file: it does not begin as one")
+            raise NotMcap(f"{source} is not an MCAP file; its first bytes are wrong")
         data.seek(0)
         temporary = target.with_name(f".{target.name}.part")
         try:
@@ -64,7 +64,7 @@ def recover(source: Path, target: Path) -> Recovered:
                 _copy(data, out, found)
             if not found.messages:
                 raise NotMcap(
-                    f"{source} holds no whole message: {found.torn or 'it is empty'}; there is nothing to save"
+                    f"{source} has no complete message: {found.torn or 'it is empty'}; nothing can be recovered"
                 )
             temporary.replace(target)
         finally:

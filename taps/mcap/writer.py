@@ -106,7 +106,7 @@ class McapFile:
         if self._reserve and not _is_device(self.path):
             free = free_bytes(self.path.parent)
             if free < self._reserve:
-                raise NoRoom(f"only {free >> 20} MB are free there (--reserve keeps {self._reserve >> 20})")
+                raise NoRoom(f"only {free >> 20} MB are free there (--reserve requires {self._reserve >> 20})")
 
     def _open(self, topic: str) -> int:
         about = TOPICS[topic]

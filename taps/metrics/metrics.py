@@ -19,17 +19,17 @@ CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _QUANTILES: Final = ("0.5", "0.99", "1")
 _COUNTERS: Final = {
     "cycles": "cycles of the estimate",
-    "overruns": "cycles that took longer than their budget",
+    "overruns": "cycles that exceeded their budget",
     "scans": "scans received",
     "scans_missed": "scans lost",
-    "scans_invalid": "scans received and unusable",
-    "scans_dropped": "scans that a later one replaced",
-    "resyncs": "times the lidar's bytes were searched for a new beginning",
-    "reconnects": "times the lidar was opened again",
+    "scans_invalid": "unusable scans",
+    "scans_dropped": "scans replaced by a later one",
+    "resyncs": "resynchronisations of the lidar's byte stream",
+    "reconnects": "reconnections of the lidar",
     "blocks": "blocks of photodiode samples",
-    "blocks_lost": "of those, of no use",
+    "blocks_lost": "unused blocks of photodiode samples",
     "odometry_jumps": "jumps of wheel odometry",
-    "jobs_failed": "background jobs that failed",
+    "jobs_failed": "failed background jobs",
 }
 Labels = dict[str, str]
 Sample = tuple[Labels, float]
@@ -103,16 +103,16 @@ def _families(latest: Latest, now: float) -> Iterator[tuple[str, str, str, Itera
         yield from _of_lights(latest.lights)
     if latest.faults is not None:
         present = [({"fault": str(one.fault), "meaning": one.meaning}, 1.0) for one in latest.faults.present]
-        yield "lumiloop_fault", "gauge", "1 for each fault that is present", present
-        yield "lumiloop_faults_present", "gauge", "how many are", [({}, float(len(present)))]
+        yield "lumiloop_fault", "gauge", "1 for each present fault", present
+        yield "lumiloop_faults_present", "gauge", "number of present faults", [({}, float(len(present)))]
     if latest.statistics is not None:
         yield from _of_statistics(latest.statistics)
 
 
 def _of_pose(pose: Pose, now: float) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
     states = [({"state": state.name}, float(state == pose.state)) for state in State]
-    yield "lumiloop_state", "gauge", "1 for the state that is", states
-    yield "lumiloop_pose_age_seconds", "gauge", "since the instant that the pose is true for", [({}, now - pose.t_mono)]
+    yield "lumiloop_state", "gauge", "1 for the present state", states
+    yield "lumiloop_pose_age_seconds", "gauge", "age of the pose", [({}, now - pose.t_mono)]
     if pose.pose is not None:
         x, y, yaw = pose.pose
         place = [({"axis": "x"}, x), ({"axis": "y"}, y)]
@@ -122,22 +122,27 @@ def _of_pose(pose: Pose, now: float) -> Iterator[tuple[str, str, str, Iterable[S
         xx, _, yy, _, _, turn = (max(0.0, value) for value in pose.covariance)
         sigma = [({"axis": "x"}, math.sqrt(xx)), ({"axis": "y"}, math.sqrt(yy))]
         yield "lumiloop_pose_sigma_metres", "gauge", "its deviation", sigma
-        yield "lumiloop_pose_sigma_yaw_radians", "gauge", "that of its heading", [({}, math.sqrt(turn))]
+        yield "lumiloop_pose_sigma_yaw_radians", "gauge", "sigma of the heading", [({}, math.sqrt(turn))]
     known = [({"axis": axis}, float(observed)) for axis, observed in zip(("x", "y", "yaw"), pose.known, strict=True)]
     yield "lumiloop_axis_known", "gauge", "whether an axis is observed", known
     if pose.trust.horizontal_m is not None:
         level: list[Sample] = [({}, pose.trust.horizontal_m)]
-        yield "lumiloop_protection_level_metres", "gauge", "bound on the error of the pose", level
-    yield "lumiloop_alert", "gauge", "the bound is above its limit, or there is none", [({}, float(pose.trust.alert))]
+        yield "lumiloop_protection_level_metres", "gauge", "protection level of the pose", level
+    yield (
+        "lumiloop_alert",
+        "gauge",
+        ("the protection level is above its limit, or there is none"),
+        [({}, float(pose.trust.alert))],
+    )
     yield "lumiloop_jumps_total", "counter", "jumps of the map pose", [({}, float(pose.jumps))]
     yield "lumiloop_loops_total", "counter", "loop closures", [({}, float(pose.loop_counter))]
     if pose.scan_rate is not None:
         yield "lumiloop_scan_rate_hertz", "gauge", "scans a second", [({}, pose.scan_rate)]
     if pose.pulse is not None:
-        yield "lumiloop_rung", "gauge", "what is left out for lack of time", [({}, float(pose.pulse.rung))]
-        yield "lumiloop_stalls_total", "counter", "times no cycle began in time", [({}, float(pose.pulse.stalls))]
+        yield "lumiloop_rung", "gauge", "degradation level", [({}, float(pose.pulse.rung))]
+        yield "lumiloop_stalls_total", "counter", "stalls of the cycle", [({}, float(pose.pulse.stalls))]
         yield "lumiloop_cycle_seconds", "summary", "computing time of recent cycles", _spread(pose.pulse.cycle)
-        yield "lumiloop_late_seconds", "summary", "how late recent cycles began", _spread(pose.pulse.late)
+        yield "lumiloop_late_seconds", "summary", "start delay of recent cycles", _spread(pose.pulse.late)
         stages = [
             ({"stage": stage.name.lower(), **labels}, value)
             for stage, spread in zip(Stage, pose.pulse.stages, strict=False)
@@ -154,13 +159,13 @@ def _of_pose(pose: Pose, now: float) -> Iterator[tuple[str, str, str, Iterable[S
 def _of_lights(lights: Lights) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:
     uses = [link.use for link in lights.links]
     counted = [({"use": use.name.lower()}, float(uses.count(use))) for use in LinkUse]
-    yield "lumiloop_links", "gauge", "lamps in view, by what they are used for", counted
+    yield "lumiloop_links", "gauge", "lamps in view, by link use", counted
     lamps = [
         ({"lamp": str(link.lamp_id), "code": str(link.code)}, link.residual)
         for link in lights.links
         if link.lamp_id is not None and link.residual is not None
     ]
-    yield "lumiloop_lamp_residual", "gauge", "ln of received over expected", lamps
+    yield "lumiloop_lamp_residual", "gauge", "ln of received over expected RSS", lamps
 
 
 def _of_statistics(statistics: Statistics) -> Iterator[tuple[str, str, str, Iterable[Sample]]]:

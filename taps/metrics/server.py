@@ -55,7 +55,9 @@ def main(args: argparse.Namespace) -> int:
     except NotTheStream as error:
         return console.fail(str(error))
     except OSError as error:
-        return console.fail(f"cannot listen on {args.listen}: {error.strerror}; free it, or name another with --listen")
+        return console.fail(
+            f"cannot listen on {args.listen}: {error.strerror}; free the address, or name another with --listen"
+        )
     return console.OK
 
 
@@ -99,7 +101,7 @@ class HttpHandler:
         except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
             return
         except Exception as error:  # noqa: BLE001  any failure ends this connection alone
-            log_once(log, self._defects, error, "a request cannot be answered; its connection is closed")
+            log_once(log, self._defects, error, "serving a request has failed; its connection is closed")
         finally:
             self._peers.remove(peer)
             writer.close()
@@ -107,14 +109,12 @@ class HttpHandler:
     def _answer(self, request: bytes) -> bytes:
         words = request.partition(b"\r\n")[0].decode("latin-1").split(" ")
         if len(words) != 3 or not words[2].startswith("HTTP/1."):
-            return _response(400, "text/plain", "not a request of HTTP/1\n")
+            return _response(400, "text/plain", "not an HTTP/1 request\n")
         if not self._host_allowed(request):
-            return _response(
-                403, "text/plain", "this computer is asked under a name that is not its own: use its address\n"
-            )
+            return _response(403, "text/plain", "the request names another host; use this computer's address\n")
         method, path = words[0], words[1].partition("?")[0]
         if method not in ("GET", "HEAD"):
-            return _response(405, "text/plain", "this only tells: GET\n")
+            return _response(405, "text/plain", "only GET is possible\n")
         status, kind, body = self._document(path)
         return _response(status, kind, body, head=method == "HEAD")
 
@@ -134,7 +134,7 @@ class HttpHandler:
                 latest = messages.latest(time.monotonic())
                 made = None if latest is None else make(latest, messages.held)
                 if made is None:
-                    why = "the daemon does not answer" if not messages.up else "there is no pose yet"
+                    why = "the daemon does not answer" if not messages.up else "no pose is available yet"
                     return 503, _JSON, json.dumps({"error": why}) + "\n"
                 return 200, _JSON, json.dumps({"agvPosition" if second else "mobileRobotPosition": made}) + "\n"
             case "/":

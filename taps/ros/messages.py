@@ -54,8 +54,8 @@ class Topic:
 
 TOPICS: Final = {
     "/scan": Topic("sensor_msgs/msg/LaserScan", "each scan after REP-117; the stamp is the first beam's"),
-    "/pose": Topic("geometry_msgs/msg/PoseWithCovarianceStamped", "the pose in the map, while the place is known"),
-    "/odom": Topic("nav_msgs/msg/Odometry", "the pose in odom, smooth, with the velocity"),
+    "/pose": Topic("geometry_msgs/msg/PoseWithCovarianceStamped", "the pose in the map, while the position is known"),
+    "/odom": Topic("nav_msgs/msg/Odometry", "the pose in odom, continuous, with the velocity"),
     "/tf": Topic("tf2_msgs/msg/TFMessage", "map > odom > base_link"),
     "/tf_static": Topic("tf2_msgs/msg/TFMessage", "base_link > laser", latched=True),
     "/map": Topic("nav_msgs/msg/OccupancyGrid", "the map", latched=True),
@@ -340,7 +340,7 @@ class Translator:
         pulse = frame.pulse
         if pulse is not None:
             late = {"rung": pulse.rung, "stalls": pulse.stalls, "overruns": frame.overruns, "cycle_us": frame.cycle_us}
-            found.append(_status(WARN if pulse.rung else OK, "cycle", f"rung {pulse.rung}", late))
+            found.append(_status(WARN if pulse.rung else OK, "cycle", f"degradation level {pulse.rung}", late))
         if self._statistics is not None:
             figures = {name: getattr(self._statistics, name) for name in self._statistics.__struct_fields__}
             found.append(_status(OK, "counters", "since the start", figures))

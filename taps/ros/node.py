@@ -63,7 +63,7 @@ async def serve(args: argparse.Namespace, namespace: str, stream: Stream) -> Non
         watching = asyncio.create_task(watch_router(session, args.router, lambda present: None))
         work = [asyncio.create_task(wait_for_rival(session, node))]
         try:
-            console.say(f"node {namespace}/{NAME} in domain {node.domain} by way of {args.router}")
+            console.say(f"node {namespace}/{NAME} in domain {node.domain} through {args.router}")
             work.append(asyncio.create_task(forward(stream, args.settings, publisher)))
             ended, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
             for task in ended:
@@ -78,8 +78,8 @@ async def serve(args: argparse.Namespace, namespace: str, stream: Stream) -> Non
 def name_taken(node: rmw_zenoh.Node) -> str:
     """Message for two nodes of one name, with a remedy."""
     return (
-        f"domain {node.domain} has a node {node.namespace}/{NAME} already: two robots on the same topics would "
-        "spoil both; give each a --namespace of its own, or stop the other one"
+        f"domain {node.domain} has a node {node.namespace}/{NAME} already; give each robot its own "
+        "--namespace, or stop the other one"
     )
 
 

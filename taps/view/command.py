@@ -48,7 +48,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         token = token_for(args.bind, args.write, args.token)
         if token and args.token is None and to_journal():
-            raise CannotServe("nobody could read a fresh token but in the log: name a file with one, --token FILE")
+            raise CannotServe("a new token would be visible only in the log; name a file with a token, --token FILE")
         return _show(args, Guard(args.bind, token, args.write))
     except (TokenRefused, SurveyError, NoAnswer, CannotServe) as error:
         return console.fail(str(error))
@@ -68,9 +68,9 @@ def _show(args: argparse.Namespace, guard: Guard) -> int:
         )
         return _serve(view, guard, args.port, f"lumiloop {settings.name}")
     if args.write:
-        return console.fail("a recording takes no orders: leave --write out", console.USAGE)
+        return console.fail("a recording accepts no commands; omit --write", console.USAGE)
     if not args.log.exists():
-        return console.fail(f"{args.log}: there is no such recording")
+        return console.fail(f"{args.log}: no such recording")
     with _film(args) as film:
         return _serve(View(guard, Scene(settings.name), film=film), guard, args.port, f"recording {args.log}")
 
@@ -130,12 +130,12 @@ def _record(log: Path, settings: Config, given: tuple[bool, tuple[str, ...]], ou
     try:
         import_module("taps.view.replay_recorder").record(source, settings, given, out)
     except OSError as error:
-        console.fail(f"{out}: {error.strerror}; the recording is shown as far as it was replayed")
+        console.fail(f"{out}: {error.strerror}; the recording is shown up to there")
 
 
 def _wait(film: ReplayFile) -> None:
     """Wait until the recording has proved readable."""
-    console.say("replaying the recording; it can be watched meanwhile")
+    console.say("replaying the recording; the page shows it meanwhile")
     while film.scene is None and not film.done:
         time.sleep(0.05)
         film.refresh()

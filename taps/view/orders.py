@@ -53,9 +53,9 @@ class Orders:
         """
         name, pose = str(message.get("order")), _pose_of(message)
         if name not in NAMES:
-            raise CommandRefused(f"there is no order {name[:40]!r}")
+            raise CommandRefused(f"unknown command {name[:40]!r}")
         if not self._address[1]:
-            raise CommandRefused("the configuration switches Modbus off (`modbus.port` is 0), which carries orders")
+            raise CommandRefused("commands need Modbus, which is disabled (`modbus.port` is 0)")
         async with self._sending:
             await self._send(viewer, name, pose)
 
@@ -104,10 +104,10 @@ def _pose_of(message: Mapping[str, Any]) -> tuple[float, float, float]:
         return 0.0, 0.0, 0.0
     values = message.get("pose")
     if not isinstance(values, list) or len(values) != 3 or not all(_is_number(value) for value in values):
-        raise CommandRefused("set_pose wants a pose: x, y in m, yaw in rad")
+        raise CommandRefused("set_pose needs x and y in m, and yaw in rad")
     x, y, yaw = (float(value) for value in values)
     if max(abs(x), abs(y)) > FARTHEST_M:
-        raise CommandRefused(f"a pose more than {FARTHEST_M:.0f} m away")
+        raise CommandRefused(f"the pose is more than {FARTHEST_M:.0f} m away")
     return x, y, math.remainder(yaw, 2.0 * math.pi)
 
 

@@ -21,7 +21,7 @@ from taps.view.viewers import Tile
 KINDS: Final = ("pose", "lights", "scan", "statistics", "loop", "state", "faults", "row", "map", "scene", "end")
 HEAD: Final = struct.Struct("<dBI")
 """Head of each message: time, kind, length."""
-DIED: Final = "the replay has died before its end (no memory, or no room in the folder of temporary files?)"
+DIED: Final = "the replay process has ended early; check free memory and the folder of temporary files"
 
 _tile: Final = msgspec.msgpack.Decoder(tuple[int, int, bytes, dict[str, float]]).decode
 

@@ -27,7 +27,9 @@ class ClientFaults(logging.Filter):
         error = record.exc_info[1] if record.exc_info else None
         if not isinstance(error, HttpProcessingError | ConnectionError | TimeoutError):
             return True
-        self._lines.say(time.monotonic(), logging.WARNING, "a client sent what is no HTTP request; it was refused")
+        self._lines.say(
+            time.monotonic(), logging.WARNING, "a client sent data that is not an HTTP request; it was rejected"
+        )
         return False
 
 

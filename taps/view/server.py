@@ -44,7 +44,7 @@ VIEWERS: Final = 32
 UNAUTHENTICATED: Final = 16
 """Most connections before authentication; they do not count as viewers. A further one replaces the oldest one of the
 host that has most of them."""
-FULL: Final = f"{VIEWERS} browsers are watching, or {most_of(VIEWERS)} of one computer; close one."
+FULL: Final = f"{VIEWERS} browsers are connected, or {most_of(VIEWERS)} from one computer; close one."
 PACE_S: Final = 0.04
 """Least time between two messages to a browser."""
 KEPT_BYTES: Final = 64 << 10
@@ -107,7 +107,7 @@ class View:
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Check the Host header, handle the request, and add the security headers."""
         if not self._guard.host_ok(request.headers.get("Host", "")):
-            text = "This page is not called by that name. Use the address that `lumiloop view` printed.\n"
+            text = "This page has another address. Use the address that `lumiloop view` printed.\n"
             return web.Response(status=421, text=text, headers=HEADERS)
         try:
             response = await handler(request)
@@ -121,7 +121,7 @@ class View:
     async def _file(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info["name"] or "index.html"
         if name not in self._files:
-            raise web.HTTPNotFound(text="There is no such file; the page is at /\n")
+            raise web.HTTPNotFound(text="No such file. The page is at /\n")
         tag = f'"{self.page}"'
         if request.headers.get("If-None-Match") == tag:
             return web.Response(status=304, headers={"ETag": tag})
@@ -130,7 +130,7 @@ class View:
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         if not self._guard.origin_ok(request.headers.get("Origin"), request.headers.get("Host", "")):
-            raise web.HTTPForbidden(text="Only the page of this server may open this.\n")
+            raise web.HTTPForbidden(text="Only the page of this server can open this.\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LONGEST_MESSAGE, compress=False)
         await socket.prepare(request)
         _limit_buffers(request)
@@ -150,7 +150,7 @@ class View:
             most = largest(waiting.values())
             oldest = next(one for one, peer in waiting.items() if host_of(peer) == most)
             del waiting[oldest]
-            await _refuse(oldest, "words", "Others came before it said who it is.")
+            await _refuse(oldest, "words", "Other clients connected first.")
         waiting[socket] = host
         try:
             return await self._authenticate(socket, host)
@@ -162,13 +162,13 @@ class View:
         message = await _receive_json(socket, HELLO_S)
         token = None if message is None else message.get("token")
         if message is None:
-            await _refuse(socket, "words", "A page says first who it is.")
+            await _refuse(socket, "words", "The page must first send its token.")
             return None
         if token is not None and not self._guard.token_ok(token):
             async with self._guesses:
                 await asyncio.sleep(WRONG_TOKEN_S)
         if not self._guard.may_watch(token):
-            await _refuse(socket, "token", "This page is shown to those who have its token.")
+            await _refuse(socket, "token", "This page needs its token.")
             return None
         if len(self._sockets) >= VIEWERS or full_for(host, self._sockets.values(), VIEWERS):
             await _refuse(socket, "full", FULL)
@@ -240,7 +240,7 @@ class View:
                 log.error("%s", error)
             except Exception:  # an internal error: the page shows it and continues
                 self.hub.disconnected("an internal error of the page's server; see the log of `lumiloop view`")
-                log.exception("what the daemon told could not be shown")
+                log.exception("the data of the daemon could not be shown")
             await asyncio.sleep(TRY_AGAIN_S)
 
     def _reload_scene(self) -> None:
@@ -248,7 +248,7 @@ class View:
         try:
             scene = self._scene if self._again is None else self._again()
         except SceneUnreadable as error:
-            log.warning("lamps and mount are shown as they were before: %s", error)
+            log.warning("the previous lamps and mount are shown: %s", error)
             return
         if scene != self._scene:
             self._scene = scene
@@ -288,9 +288,9 @@ async def _close_on_error(socket: web.WebSocketResponse, work: Coroutine[Any, An
     try:
         await work
     except ConnectionError:
-        log.debug("a browser has gone", exc_info=True)
+        log.debug("a browser has disconnected", exc_info=True)
     except Exception:  # an internal error
-        log.exception("a browser could not be told what it should see")
+        log.exception("sending to a browser has failed")
         with contextlib.suppress(ConnectionError, RuntimeError):
             await socket.close(code=WSCloseCode.INTERNAL_ERROR, message=b"the log of `lumiloop view` says why")
 

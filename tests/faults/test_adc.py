@@ -77,32 +77,32 @@ CHIP = [
 WRONG = [
     Case(f"what = 'replaced'; chip = '{chip}'", noun, says, within=REOPEN, noticed=PERSISTS, start=start, **where)
     for chip, noun, says, start, where in (
-        ("ADS1115", DeviceRefused, "is no MCP3221: it has registers", False, {}),
-        ("ADS1115", DeviceRefused, "is no MCP3221: it has registers", True, {}),
-        ("LM75", DataInvalid, "words with bits it keeps at zero.*another kind", False, {}),
+        ("ADS1115", DeviceRefused, "is not an MCP3221: it has registers", False, {}),
+        ("ADS1115", DeviceRefused, "is not an MCP3221: it has registers", True, {}),
+        ("LM75", DataInvalid, "data words with bits that it keeps at zero.*another kind", False, {}),
         ("24C02", DeviceRefused, "bit 1 at zero", True, ADC121),
         ("MCP3221", DeviceRefused, "has no registers", True, ADC121),
-        ("LM75", DeviceRefused, "is no ADC121C021", True, ADC121),
+        ("LM75", DeviceRefused, "is not an ADC121C021", True, ADC121),
     )
 ]
 
 BUS = [
-    Case("what = 'gone'", DeviceMissing, "adapter is gone.*plug it in", within=REOPEN),
+    Case("what = 'gone'", DeviceMissing, "the adapter was removed.*connect it", within=REOPEN),
     Case("what = 'gone'", DeviceMissing, "no such bus", within=REOPEN, start=True),
     Case("what = 'refuse'", DeviceRefused, "permission denied .*group i2c", within=REOPEN, start=True),
     Case("what = 'refuse'; why = 'busy'", DeviceRefused, "in use", within=REOPEN, start=True),
     Case("what = 'refuse'", blocks=150),
-    Case("what = 'hang'", DeviceFault, "nothing has been read for 5 blocks", within=REOPEN),
+    Case("what = 'hang'", DeviceFault, "no data were read for 5 blocks", within=REOPEN),
     Case("what = 'hang'; for = 60", DeviceFault, "bus is stuck.*power off and on", within=REOPEN, noticed=TIME_OUT),
     Case("what = 'hang'", DeviceFault, "bus is stuck", within=REOPEN, start=True, noticed=TIME_OUT),
     Case("what = 'nack'; every = 10", blemish=Blemish.GAP, blocks=100),
     Case("what = 'nack'; on = 'all'", DeviceMissing, "no MCP3221", within=REOPEN),
     Case("what = 'intermittent'; share = 0.2", blemish=Blemish.GAP, within=REOPEN, blocks=40),
-    Case("what = 'timeout'; every = 20", DeviceFault, "nothing has been read", Blemish.GAP, 3.0, 20, noticed=1.4),
-    Case("what = 'timeout'", DeviceFault, "nothing has been read for 5 blocks", within=REOPEN),
+    Case("what = 'timeout'; every = 20", DeviceFault, "no data were read for", Blemish.GAP, 3.0, 20, noticed=1.4),
+    Case("what = 'timeout'", DeviceFault, "no data were read for 5 blocks", within=REOPEN),
     Case("what = 'timeout'; for = 60", DeviceFault, "timed out", within=REOPEN, noticed=TIME_OUT),
     Case("what = 'arbitration'; every = 3", blemish=Blemish.GAP, blocks=90),
-    Case("what = 'arbitration'", DeviceFault, "arbitration .* lost again and again", within=REOPEN),
+    Case("what = 'arbitration'", DeviceFault, "arbitration on the bus is lost repeatedly", within=REOPEN),
     Case("what = 'delayed'; by_s = 0.15", blemish=Blemish.STRETCHED, within=STEP, blocks=15),
     Case("what = 'delayed'; by_s = 4.0", DeviceFault, "not returned for 3 s.*unbind", within=6.0, noticed=3.2),
 ]
@@ -133,11 +133,11 @@ LASTING = [
         ("EREMOTEIO", DeviceMissing, "no MCP3221"),
         ("EAGAIN", DeviceFault, "arbitration"),
         ("EBUSY", DeviceRefused, "address 0x4d is in use by another lumiloop or program, or by a kernel driver"),
-        ("EOPNOTSUPP", DeviceRefused, "does not do such reads"),
-        ("EINVAL", DeviceRefused, "does not do such reads"),
-        ("ENODEV", DeviceMissing, "adapter is gone"),
-        ("ESHUTDOWN", DeviceMissing, "adapter is gone"),
-        ("ENOENT", DeviceMissing, "adapter is gone"),
+        ("EOPNOTSUPP", DeviceRefused, "the adapter does not support these reads"),
+        ("EINVAL", DeviceRefused, "the adapter does not support these reads"),
+        ("ENODEV", DeviceMissing, "the adapter was removed"),
+        ("ESHUTDOWN", DeviceMissing, "the adapter was removed"),
+        ("ENOENT", DeviceMissing, "the adapter was removed"),
         ("EACCES", DeviceRefused, "permission denied.*group i2c"),
         ("EPROTO", DeviceFault, "EPROTO"),
         ("ETIMEDOUT", DeviceFault, "bus is stuck"),
@@ -161,33 +161,57 @@ BYTES = [
     Case(
         "what = 'stuck'",
         DeviceFault,
-        "no signal: no light at all, or so much.*or a dead converter",
+        "no light, or so much that the amplifier is.*or a defective converter",
         Blemish.STUCK,
         noticed=PERSISTS,
     ),
     Case("what = 'stuck'; every = 3", None, "", Blemish.STUCK, blocks=150),
-    Case("what = 'garbage'", DataInvalid, "bits it keeps at zero", Blemish.MISALIGNED, REOPEN),
+    Case("what = 'garbage'", DataInvalid, "data words with bits that it keeps at zero", Blemish.MISALIGNED, REOPEN),
     Case("what = 'garbage'; every = 3", None, "", Blemish.MISALIGNED, blocks=150),
-    Case("what = 'shift'", DataInvalid, "bits it keeps at zero|without their highest bits", Blemish.MISALIGNED, REOPEN),
+    Case(
+        "what = 'shift'",
+        DataInvalid,
+        "bits that it keeps at zero|without their highest bits",
+        Blemish.MISALIGNED,
+        REOPEN,
+    ),
     Case("what = 'shift'; bits = 4; every = 5", None, "", Blemish.MISALIGNED, blocks=150),
     Case("what = 'hit'", None, "", Blemish.REPAIRED, blocks=150),
     Case("what = 'hit'; words = 15; mask = 0xffff", None, "", Blemish.REPAIRED, blocks=150),
-    Case("what = 'hit'; words = 100", DataInvalid, "bits it keeps at zero", Blemish.MISALIGNED, REOPEN),
+    Case(
+        "what = 'hit'; words = 100",
+        DataInvalid,
+        "data words with bits that it keeps at zero",
+        Blemish.MISALIGNED,
+        REOPEN,
+    ),
     Case("what = 'floats'", DeviceFault, "the bus floats", Blemish.MISALIGNED, REOPEN),
     Case("what = 'released'; at = 0.4; every = 4", None, "", Blemish.SHORT, blocks=150),
     Case("what = 'short'; bytes = 301; every = 4", None, "", Blemish.SHORT, blocks=150),
     Case(
-        "what = 'wrong'; by = 2000", DeviceFault, "20 % of the samples are at the rails", Blemish.CLIPPED, noticed=2.0
+        "what = 'wrong'; by = 2000", DeviceFault, "20 % of the samples are at the limits", Blemish.CLIPPED, noticed=2.0
     ),
     Case(
-        "what = 'wrong'; by = -4095", DeviceFault, "every word is at the same rail", Blemish.CLIPPED, noticed=PERSISTS
+        "what = 'wrong'; by = -4095",
+        DeviceFault,
+        "every data word is at the same limit of the",
+        Blemish.CLIPPED,
+        noticed=PERSISTS,
     ),
 ]
 
 LIGHT = [
-    Case("what = 'clip'; gain = 20", DeviceFault, "at the rails.*shade", Blemish.CLIPPED, blocks=150, noticed=PERSISTS),
-    Case("what = 'dark'", DeviceFault, "no light at all, or so much .* DC channel", blocks=150, noticed=PERSISTS),
-    Case("what = 'saturated'", DeviceFault, "no light at all, or so much", blocks=150, noticed=PERSISTS),
+    Case(
+        "what = 'clip'; gain = 20", DeviceFault, "at the limits.*shade", Blemish.CLIPPED, blocks=150, noticed=PERSISTS
+    ),
+    Case(
+        "what = 'dark'",
+        DeviceFault,
+        "no light, or so much that the amplifier is .* DC channel",
+        blocks=150,
+        noticed=PERSISTS,
+    ),
+    Case("what = 'saturated'", DeviceFault, "no light, or so much that the amplifier is", blocks=150, noticed=PERSISTS),
 ]
 
 

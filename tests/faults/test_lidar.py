@@ -91,7 +91,7 @@ BYTES += [
 
 STAMPS = [
     Case("stamp repeated once", "what = 'frozen_stamp'; every = 10", ("invalid",), gap=0.06),
-    Case("frozen_stamp", "what = 'frozen_stamp'", ("invalid", "~its clock stands"), REOPEN),
+    Case("frozen_stamp", "what = 'frozen_stamp'", ("invalid", "~its clock has stopped"), REOPEN),
     Case("stamp_jump back once", "what = 'stamp_jump'; by_ms = -5000; count = 1", ("invalid",), gap=0.06),
     Case("stamp_jump ahead once", "what = 'stamp_jump'; by_ms = 40000; count = 1", ("invalid",), gap=0.06),
     Case("stamp_jump back", "what = 'stamp_jump'; by_ms = -5000", ("clock_resets",), gap=0.06),
@@ -107,11 +107,11 @@ STAMPS = [
 ]
 
 LINE = [
-    Case("silence", "what = 'silence'", ("resyncs", "~fallen silent"), REOPEN),
+    Case("silence", "what = 'silence'", ("resyncs", "~stopped sending"), REOPEN),
     Case("short silence", "what = 'silence'", ("missed",), seconds=0.5),
     Case("silence of a network", "what = 'silence'", ("resyncs",), REOPEN, model=UST_10LX),
     Case("stall and burst", "what = 'stall'", (), seconds=0.9, gap=0.95),
-    Case("long stall and burst", "what = 'stall'", ("resyncs", "~fallen silent"), REOPEN),
+    Case("long stall and burst", "what = 'stall'", ("resyncs", "~stopped sending"), REOPEN),
     Case("hangup", "what = 'hangup'", ("reconnects", "~."), REOPEN),
     Case("hangup of a network", "what = 'hangup'", ("reconnects", "~."), REOPEN, model=UST_10LX),
     Case("short hangup", "what = 'hangup'", ("reconnects",), 0.6, seconds=0.1),
@@ -147,20 +147,20 @@ COMMANDS = [
     Case("not_ready", "what = 'not_ready'; by_s = 3.0", ("~not now",), 2.0, start=True),
     Case("not_ready, error state", "what = 'not_ready'; by_s = 3.0; status = '0L'", ("~0L",), 5.0, start=True),
     Case("scip1 from the start", "what = 'scip1'", (), RESTART, start=True),
-    Case("scip1", "what = 'scip1'", ("resyncs", "~fallen silent"), RESTART),
+    Case("scip1", "what = 'scip1'", ("resyncs", "~stopped sending"), RESTART),
     Case("dark from the start", "what = 'dark'", (), RESTART, start=True, intensity=True),
     Case("dark", "what = 'dark'", (), gap=0.03, intensity=True),
 ]
 
 STATES = [
-    Case("status 50 once", "what = 'status'; count = 1", ("resyncs", "~hardware trouble"), RESTART),
-    Case("status 50", "what = 'status'", ("resyncs", "~hardware trouble"), REOPEN),
-    Case("status 21 once", "what = 'status'; code = 21; count = 1", ("~checking itself",), gap=0.06),
+    Case("status 50 once", "what = 'status'; count = 1", ("resyncs", "~hardware fault"), RESTART),
+    Case("status 50", "what = 'status'", ("resyncs", "~hardware fault"), REOPEN),
+    Case("status 21 once", "what = 'status'; code = 21; count = 1", ("~self-test",), gap=0.06),
     Case("status 98 once", "what = 'status'; code = 98; count = 1", ("missed",), gap=0.06),
-    Case("verify", "what = 'verify'", ("~checking itself", "missed"), AT_ONCE),
-    Case("error", "what = 'error'", ("reconnects", "~hardware trouble"), REOPEN),
-    Case("error of 2.2", "what = 'error'", ("reconnects", "~hardware trouble"), REOPEN, model=UST_10LX),
-    Case("reset", "what = 'reset'", ("resyncs", "~fallen silent"), RESTART, unit=Unit(clock_ms=9_000_000)),
+    Case("verify", "what = 'verify'", ("~self-test", "missed"), AT_ONCE),
+    Case("error", "what = 'error'", ("reconnects", "~hardware fault"), REOPEN),
+    Case("error of 2.2", "what = 'error'", ("reconnects", "~hardware fault"), REOPEN, model=UST_10LX),
+    Case("reset", "what = 'reset'", ("resyncs", "~stopped sending"), RESTART, unit=Unit(clock_ms=9_000_000)),
     Case("reset, slow start", "what = 'boot_delay' + what = 'reset'; when = 0.1", ("resyncs",), REOPEN, seconds=3.5),
     Case("off and a slow start", "what = 'boot_delay'; by_s = 2.0 + what = 'off'; for = 1.0", ("reconnects",), REOPEN),
 ]  # fmt: skip
@@ -170,7 +170,7 @@ WORDS = [
     Case("off of a serial line", "what = 'off'", ("resyncs", "~."), 12.0, model=replace(URG_04LX, rpm=600)),
     Case("off of a network", "what = 'off'", ("reconnects", "~."), REOPEN, model=UST_10LX),
     Case("slow by half", "what = 'slow'; factor = 1.5", (), RESTART),
-    Case("stuck", "what = 'stuck'", ("invalid", "~its clock stands"), REOPEN),
+    Case("stuck", "what = 'stuck'", ("invalid", "~its clock has stopped"), REOPEN),
     Case("slow", "what = 'slow'", (), 0.15, gap=0.06),
     Case("delayed", "what = 'delayed'", (), 0.4, gap=0.35),
     Case("intermittent", "what = 'intermittent'", ("missed",), gap=0.4),

@@ -21,7 +21,7 @@ def test_every_fault_is_in_the_index_by_its_number() -> None:
     part = PAGE.read_text().partition("## By number")[2]
     numbers = [int(number) for number in re.findall(r"^\| (\d+) \|", part, re.MULTILINE)]
     assert numbers == sorted(int(fault) for fault in Fault if fault)
-    assert "| 101 | the lidar is not there | lidar off" in part
+    assert "| 101 | no lidar is found | lidar off" in part
 
 
 def test_every_fault_of_the_computer_has_a_row_that_names_its_test() -> None:

@@ -99,7 +99,7 @@ def served_lidar(folder: Path, *where: str) -> Generator[Served]:
     control = folder / "lidar.control"
     place = where or ("--pty", str(folder / "lidar"))
     command = [sys.executable, "-m", "hal.fake", "--model", "UHG-08LX", "--world", "still", *place]
-    with process([*command, "--control", str(control)], lambda said: "fault orders on" in said):
+    with process([*command, "--control", str(control)], lambda said: "fault commands on" in said):
         yield Served(str(folder / "lidar"), SocketOperator(str(control)), folder)
 
 
@@ -108,7 +108,7 @@ def served_receiver(folder: Path) -> Generator[str]:
     """A converter on a bus of its own; what ``--adc`` has to be."""
     bus = f"unix:{folder / 'bus'}"
     command = [sys.executable, "-m", "hal.fake.adc.receiver", bus, "--control", str(folder / "adc.control")]
-    with process(command, lambda said: "fault orders on" in said):
+    with process(command, lambda said: "fault commands on" in said):
         yield f"{bus}@0x4d"
 
 

@@ -168,7 +168,7 @@ async def test_is_unplugged_and_plugged_in_again(lidar: LidarEnd, told: Telling)
         told.say(f"said {seconds:.2f} s after: {driver.status.error}")
         await asyncio.sleep(0.5)
         before = len(scans)
-        await asked(lidar).ask("plug it in again", "clear hangup lidar")
+        await asked(lidar).ask("connect it again", "clear hangup lidar")
         back = await lidar.until(lambda: len(scans) > before, 30.0, lambda: f"no scan: {driver.status.error}")
         told.figure("scans again after", back, "s", worse="more", room=3.0)
         assert driver.status.reconnects >= 1

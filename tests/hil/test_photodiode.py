@@ -97,7 +97,7 @@ async def test_is_unplugged_and_plugged_in_again(adc: AdcEnd, told: Telling) -> 
         seconds = await adc.until(gone, 15.0, lambda: f"nothing is said of it: {driver.status}")
         told.say(f"said {seconds:.2f} s after: {driver.status.error}")
         before = len(blocks)
-        await asked(adc).ask("plug it in again", "clear off adc")
+        await asked(adc).ask("connect it again", "clear off adc")
         back = await adc.until(lambda: len(blocks) > before + 2, 40.0, lambda: f"no samples: {driver.status.error}")
         told.figure("samples again after", back, "s", worse="more", room=3.0)
     finally:

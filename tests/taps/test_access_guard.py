@@ -71,7 +71,7 @@ def test_tokens(tmp_path: Path) -> None:
         file.write_text(text)
         with pytest.raises(TokenRefused, match="16 to 256"):
             token_for("127.0.0.1", True, file)
-    with pytest.raises(TokenRefused, match="cannot be read"):
+    with pytest.raises(TokenRefused, match="cannot read the token"):
         token_for("127.0.0.1", True, tmp_path / "none")
 
 
@@ -112,14 +112,14 @@ def test_what_cannot_be_shown_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["view", str(tmp_path / "none")]) == 1
     assert "no such recording" in capsys.readouterr().err
     assert main(["view", str(tmp_path), "--write"]) == 2
-    assert "takes no orders" in capsys.readouterr().err
+    assert "accepts no commands" in capsys.readouterr().err
     assert main(["view", "--token", str(tmp_path / "none"), "--write"]) == 1
-    assert "cannot be read" in capsys.readouterr().err
+    assert "cannot read the token" in capsys.readouterr().err
     assert main(["view", "--bind", "203.0.113.1", "--port", "0"]) == 1
     assert "--bind" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["view", "--port", "70000"])
-    assert "70000: a port is 1 to 65535" in capsys.readouterr().err
+    assert "70000: not a port; give 1 to 65535" in capsys.readouterr().err
 
 
 def test_the_page_is_served_without_the_estimator() -> None:

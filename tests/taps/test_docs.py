@@ -62,7 +62,7 @@ def test_the_doctor_of_the_documents(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("daemon.cli.doctor.Host", Computer)
     assert cli_parser.main(words) == console.OK
-    assert "nothing has to be fixed" in capsys.readouterr().out
+    assert "no problem was found" in capsys.readouterr().out
     assert issubclass(Computer, Host)
 
 

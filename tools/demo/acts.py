@@ -25,7 +25,7 @@ SHORTEST_S: Final = 45.0
 _ANSWER_S: Final = 2.0
 
 
-AWAY: Final = "the robot is lifted and carried away"
+AWAY: Final = "the robot is lifted and moved to another position"
 RIGHT_M: Final = 0.2
 """A pose that is off by less is right."""
 CARRY: Final = f"carry where={ROBOT} ahead={AHEAD_S:g} takes={TAKES_S:g}"
@@ -61,7 +61,7 @@ class Act:
         began, ended = ("lifted", "put down") if self.device == ROBOT else ("off", "on again")
         name = f"{NAMES[self.device]} {began}"
         if self.state == "to come":
-            return f"{name}: it did not come to that"
+            return f"{name}: not reached"
         lost = f"TRACKING lost after {self.seen:.1f} s" if self.seen is not None else "TRACKING was not lost"
         told = f"{name}: {lost if self.tracked else 'the state was not TRACKING before'}"
         if self.state == "off":
@@ -160,7 +160,7 @@ class Stage:
                     while not answer.startswith(("ok", "refused")) and (read := lines.readline()):
                         answer = read
         except OSError as error:
-            raise OrderRefused(f"the simulator does not take orders: {error}") from error
+            raise OrderRefused(f"the simulator accepts no commands: {error}") from error
         if not answer.startswith("ok"):
             raise OrderRefused(f"the simulator refused `{line}`: {answer.strip()}")
 
@@ -197,7 +197,7 @@ def complaint(acts: list[Act]) -> str:
             continue
         stayed = act.tracked and act.seen is None
         if stayed and act.device == ROBOT:
-            return "the robot was carried away and the state stayed TRACKING"
+            return "the robot was moved by hand, but the state stayed TRACKING"
         if act.back is None and act.device == ROBOT:
             return "the robot was put down again, but the state has not become TRACKING since"
         if act.right is None and act.device == ROBOT:

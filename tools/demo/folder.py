@@ -71,7 +71,7 @@ def keep(folder: Path, out: Path, building: str) -> str:
     (out / CONFIG).write_text(wiring.config())
     (out / NOTE).write_text(note(out, building, lit))
     if not (out / RECORDING).exists():
-        return "there is no recording"
+        return "no recording was made"
     if wrong := _replay(out):
         return f"the recording could not be replayed: {wrong}"
     shutil.copyfile(out / "replay" / PICTURE, out / PICTURE)
@@ -94,18 +94,18 @@ def note(out: Path, building: str, lit: bool) -> str:
     sim = f"python -m tools.sim --building {building} --pty {out / 'lidar'} --odometry udp://127.0.0.1:{ODOMETRY_PORT}"
     if lit:
         sim += f" --light unix:{out / 'i2c'} --survey {out / SURVEY}"
-    return f"""{PICTURE}       picture of the map, with the path of the robot
+    return f"""{PICTURE}       image of the map, with the path of the robot
 {MAP}   the map; {MAPS}/ holds it for the next start
-{RECORDING}/    everything that the sensors sent
+{RECORDING}/    recording of all sensor data
 {CONFIG}     the configuration of the daemon
 summary.json  the figures of this demo
 
-Look at the map, or replay the drive (from the root of the clone, after `. .venv/bin/activate`):
+Inspect the map, or replay the drive (from the root of the clone, after `. .venv/bin/activate`):
 
     lumiloop map info {out / MAP}
     lumiloop replay {out / RECORDING} --config {out / CONFIG} --out {out / "again"}
 
-Drive on with this map: the robot in one terminal, the daemon in another, the page in a third.
+Continue with this map: the robot in one terminal, the daemon in another, the page in a third.
 
     {sim}
     lumiloop run --config {out / CONFIG}

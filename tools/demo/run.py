@@ -126,9 +126,11 @@ class Patience:
         """
         waited = time.monotonic() - self._begin
         if child.poll() is not None:
-            raise DemoError(f"it ended with code {child.returncode} before it was ready; read {self._out / log}")
+            raise DemoError(
+                f"the process ended with code {child.returncode} before it was ready; read {self._out / log}"
+            )
         if waited > COLD_START_S:
-            raise DemoError(f"it is not ready after {COLD_START_S:.0f} s; read {self._out / log}")
+            raise DemoError(f"the process is not ready after {COLD_START_S:.0f} s; read {self._out / log}")
         if waited > self._next:
             self._next = waited + TELL_S
             progress = self._progress(log)
@@ -296,9 +298,9 @@ def play(options: argparse.Namespace, folder: Path, out: Path, score: Score) -> 
             print(f"watch it in a browser: {address}", flush=True)
         reader = stack.enter_context(Reader("127.0.0.1", modbus))
         wait_for_pose(daemon, reader, patience)
-        print(f"{options.building}: the robot drives off; its pose is on Modbus 127.0.0.1:{modbus} (UDP and TCP)")
+        print(f"{options.building}: the robot starts to drive; its pose is on Modbus 127.0.0.1:{modbus} (UDP and TCP)")
         if sys.stdin.isatty() and not options.dark:
-            print("keys: p switches the photodiode off or on, l the lidar, c carries the robot away")
+            print("keys: p switches the photodiode off or on, l the lidar, c moves the robot by hand")
         simulator.send_signal(signal.SIGUSR1)
         stack.enter_context(keyboard())
         watch(Show(reader, Track(truth), stage, [daemon, simulator]), score, options.seconds)

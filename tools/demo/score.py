@@ -150,8 +150,8 @@ def told(figures: dict[str, Any]) -> list[str]:
     missed, share = figures["scans_missed"] or 0, figures["too_slow"]
     if share > 0.0 or missed > MISSED_SHARE * sent:
         lines.append(
-            f"the computer was too slow for {100.0 * share:.0f} % of the time, {missed} of about {sent:.0f} scans were "
-            "missed: on an idle computer the figures are better"
+            f"the computer was too slow for {100.0 * share:.0f} % of the time, {missed} of about {sent:.0f} "
+            "scans were missed; the figures are better on an idle computer"
         )
     return lines
 

@@ -103,8 +103,8 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="TOML schedule of orders for `lidar`, `adc`, `robot`; starts at once",
     )
-    add("--control", type=Path, metavar="SOCKET", help="take fault orders on a unix socket while running")
-    add("--clock-ppm", type=float, default=0.0, help="how much the sensor's clock is fast, in ppm")
+    add("--control", type=Path, metavar="SOCKET", help="accept fault commands on a unix socket")
+    add("--clock-ppm", type=float, default=0.0, help="rate error of the sensor's clock, in ppm")
     add("--seconds", type=float, default=0.0, help="end after this time (default: run until interrupted)")
     return made
 
@@ -214,7 +214,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run until interrupted; 2 when something in the arguments is wrong."""
     options = Options(**vars(parser().parse_args(arguments)))
     if options.pty is not None and options.tcp is not None:
-        sys.stderr.write("one sensor has one line: give --pty or --tcp\n")
+        sys.stderr.write("a sensor has one line; give --pty or --tcp\n")
         return 2
     try:
         asyncio.run(serve(options, _say))

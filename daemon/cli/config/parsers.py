@@ -18,12 +18,12 @@ def add(commands: Commands[argparse.ArgumentParser]) -> None:
     init.add_argument(
         "file", nargs="?", type=Path, default=Path("lumiloop.toml"), metavar="FILE", help="default: %(default)s"
     )
-    init.add_argument("--force", action="store_true", help="replace a file that is there")
+    init.add_argument("--force", action="store_true", help="replace an existing file")
     init.set_defaults(body=loaded("daemon.cli.config.verbs", "init"))
-    show = verbs.add_parser("show", help="print the file in use, and every value that results")
+    show = verbs.add_parser("show", help="print the file in use and all resulting values")
     config_arguments(show)
     show.set_defaults(body=loaded("daemon.cli.config.verbs", "show"))
-    change = verbs.add_parser("set", help="change values in the file; its comments stay")
+    change = verbs.add_parser("set", help="change values in the file and keep its comments")
     change.add_argument("values", nargs="+", metavar="KEY=VALUE", help="as in modbus.port=502")
     change.add_argument("--config", type=Path, metavar="FILE", help="configuration file; default: the first found")
     change.set_defaults(body=loaded("daemon.cli.config.verbs", "change"))

@@ -16,7 +16,7 @@ def init(args: argparse.Namespace) -> int:
     file: Path = args.file
     try:
         if file.exists() and not args.force:
-            raise loader.ConfigError(f"{file} exists: name another file, or ask for it to be replaced with --force")
+            raise loader.ConfigError(f"{file} exists already; name another file, or replace it with --force")
         write_whole(file, loader.template().encode())
     except loader.ConfigError as error:
         return console.fail(str(error))
@@ -46,7 +46,7 @@ def change(args: argparse.Namespace) -> int:
     source = discovery.find(args.config)
     try:
         if source.file is None:
-            raise loader.ConfigError("there is no configuration file: make one with `lumiloop config init`")
+            raise loader.ConfigError("no configuration file was found; make one with `lumiloop config init`")
         values = dict(loader.parsed(text) for text in args.values)
         loader.write_back(source.file, values)
     except loader.ConfigError as error:

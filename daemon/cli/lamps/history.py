@@ -30,12 +30,14 @@ def tell(args: argparse.Namespace, host: Host) -> int:
     """Runs the command on a given computer."""
     settings: Config = args.settings
     if not settings.map.kept and args.history is None:
-        return console.fail("maps are not kept (`map.folder` is none), and so is nothing known of lamps", console.USAGE)
+        return console.fail(
+            "no lamp history is available, because maps are not stored (`map.folder` is none)", console.USAGE
+        )
     maps = stored_maps(settings.map.folder) if settings.map.kept else None
     path: Path = args.history or (maps.parent / FILE if maps is not None else Path(FILE))
     if args.history is not None and not path.parent.is_dir():
         return console.fail(
-            f"--history {path}: there is no folder {path.parent}; make it, or name another file", console.USAGE
+            f"--history {path}: no such folder: {path.parent}; make it, or name another file", console.USAGE
         )
     try:
         kept = load(path)
@@ -47,15 +49,16 @@ def tell(args: argparse.Namespace, host: Host) -> int:
         return console.fail(str(error))
     except OSError as error:
         return console.fail(
-            f"{error.filename or path}: {error.strerror}; run it as the daemon's user, or name --history FILE"
+            f"{error.filename or path}: {error.strerror}; run this as the daemon's user, or name a file with "
+            "--history FILE"
         )
     heard = host.listen(args.stream or stream_path(settings.name))
     verdicts = judge(by_lamp(looks), host.utc(), _said_of(heard) if isinstance(heard, Heard) else {})
     if not verdicts:
-        return console.fail("nothing is known of any lamp yet: drive under surveyed lamps until the map has been saved")
+        return console.fail("the history has no lamp yet; drive under surveyed lamps until the map is saved")
     if not isinstance(heard, Heard):
         why = heard if isinstance(heard, str) else heard.text
-        console.say(f"which lamps are dead or moved just now is not known, no daemon tells it: {why}")
+        console.say(f"no daemon reports which lamps are defective or moved at present: {why}")
     sys.stdout.write(_as_json(verdicts) if args.json else _table(verdicts))
     return console.FAILED if any(one.urgent for one in verdicts) else console.OK
 
@@ -77,7 +80,7 @@ def _table(verdicts: list[Verdict]) -> str:
     if common is not None and common < TOGETHER:
         lines.append(f"all lamps together: {100 * common:+.1f} % a year: clean the receiver's window first")
     urgent = [str(one.lamp) for one in verdicts if one.urgent]
-    lines.append(f"go to: lamp {', '.join(urgent)}" if urgent else "no lamp is urgent")
+    lines.append(f"needs attention: lamp {', '.join(urgent)}" if urgent else "no lamp is urgent")
     return "".join(f"{line}\n" for line in lines)
 
 

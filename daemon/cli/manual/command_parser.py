@@ -27,7 +27,7 @@ class CommandParser(argparse.ArgumentParser):
             choices = [str(choice) for choice in action.choices]
             hint = near(str(value), choices)
             listed = "`lumiloop help all` lists them" if action.dest == "command" else f"name {', '.join(choices)}"
-            raise argparse.ArgumentError(action, f"there is no {str(value)!r}; {hint or listed}")
+            raise argparse.ArgumentError(action, f"{str(value)!r} is unknown; {hint or listed}")
 
     def error(self, message: str) -> NoReturn:
         """argparse: end with exit code 2, and say where help is."""
@@ -94,7 +94,7 @@ def output_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("output")
     absent = argparse.SUPPRESS
     group.add_argument("-v", "--verbose", action="store_const", const="debug", dest="log_level", default=absent,
-                       help="log details, too")  # fmt: skip
+                       help="log details too")  # fmt: skip
     group.add_argument("-q", "--quiet", action="store_const", const="error", dest="log_level", default=absent,
                        help="print errors and results only")  # fmt: skip
     group.add_argument("--log-level", choices=LEVELS, default=absent, help="what to log; default: info")

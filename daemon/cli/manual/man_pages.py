@@ -10,12 +10,12 @@ from daemon.cli.manual.command_parser import subcommands, summaries
 
 EXIT_CODES = (
     ("0", "done"),
-    ("1", "failed or refused; the text gives the cause and what to do"),
+    ("1", "failed or refused; the text gives cause and remedy"),
     ("2", "wrong usage or configuration"),
     ("130", "interrupted"),
 )
 FILES = (
-    ("$LUMILOOP_CONFIG", "configuration file, before all but --config"),
+    ("$LUMILOOP_CONFIG", "configuration file; only --config takes precedence"),
     ("./lumiloop.toml", "configuration file of the working directory"),
     ("$XDG_CONFIG_HOME/lumiloop/lumiloop.toml", "configuration file of the user"),
     ("/etc/lumiloop/lumiloop.toml", "configuration file of the system"),

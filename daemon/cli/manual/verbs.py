@@ -21,7 +21,7 @@ SHELLS: Final = ("bash", "zsh", "fish")
 def add(commands: Commands[argparse.ArgumentParser], root: argparse.ArgumentParser, version: Callable[[], str]) -> None:
     """Adds the commands; ``root``: the parser that they describe."""
     helped = commands.add_parser("help", help="print options and examples of a command")
-    helped.add_argument("words", nargs="*", metavar="COMMAND", help="as in: map import; or: all")
+    helped.add_argument("words", nargs="*", metavar="COMMAND", help="for example: map import, or all")
     helped.set_defaults(body=_help(root))
     completion = commands.add_parser("completion", help="print a completion script for a shell")
     completion.add_argument("shell", choices=SHELLS, metavar="SHELL", help="bash, zsh or fish")
@@ -42,7 +42,7 @@ def _help(root: argparse.ArgumentParser) -> Body:
             below = subcommands(found)
             if word not in below:
                 hint = near(word, list(below)) or "`lumiloop help all` lists them"
-                return fail(f"there is no {word!r}; {hint}", USAGE)
+                return fail(f"no such command: {word!r}; {hint}", USAGE)
             found = below[word]
         sys.stdout.write(found.format_help())
         return OK
@@ -77,7 +77,7 @@ def _man(root: argparse.ArgumentParser, version: Callable[[], str]) -> Body:
         made = pages(root, f"lumiloop {number[0]}" if number else "lumiloop")
         name = f"lumiloop-{args.words}.1" if args.words else "lumiloop.1"
         if name not in made:
-            return fail(f"there is no {args.words!r}; `lumiloop help all` lists the commands", USAGE)
+            return fail(f"no such command: {args.words!r}; `lumiloop help all` lists the commands", USAGE)
         if args.out is None:
             sys.stdout.write(made[name])
             return OK
@@ -86,8 +86,8 @@ def _man(root: argparse.ArgumentParser, version: Callable[[], str]) -> Body:
             for file, text in made.items():
                 (args.out / file).write_text(text)
         except OSError as error:
-            return fail(f"{args.out}: cannot be written: {error.strerror}")
-        sys.stdout.write(f"{len(made)} pages into {args.out}\n")
+            return fail(f"{args.out}: cannot write the page: {error.strerror}")
+        sys.stdout.write(f"{len(made)} pages written to {args.out}\n")
         return OK
 
     return body

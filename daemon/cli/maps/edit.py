@@ -19,7 +19,9 @@ def align(args: argparse.Namespace) -> int:
     try:
         stored = opened(args.map)
         if stored.meta.surveyed:
-            raise Refused(f"{args.map}: lies in the frame of the lamps' survey; move the lamps in the survey instead")
+            raise Refused(
+                f"{args.map}: the map is in the frame of the lamp survey; move the lamps in the survey instead"
+            )
         fit = fitted([pair_of(text) for text in args.point])
         judge(fit)
         meta = msgspec.structs.replace(stored.meta, map_id=1 + secrets.randbelow(2**32 - 1))
@@ -29,8 +31,9 @@ def align(args: argparse.Namespace) -> int:
     x, y, yaw = fit.T
     off = ", ".join(f"{1e3 * one:.0f} mm" for one in fit.residual_m)
     sys.stdout.write(
-        f"moved by x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(yaw):.2f} deg; points are off by {off}; "
-        f"distances are {100.0 * (fit.scale - 1.0):+.2f} % of the map's\n{path}: map {meta.map_id:08x}\n"
+        f"map moved by x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(yaw):.2f} deg. Residuals of the points: "
+        f"{off}. Distances are {100.0 * (fit.scale - 1.0):+.2f} % of the map's\n{path}: map "
+        f"{meta.map_id:08x}\n"
     )
     return console.OK
 
@@ -43,5 +46,5 @@ def name(args: argparse.Namespace) -> int:
         path = written(args.map, args.out, stored.tables, meta)
     except (BadMap, Refused, OSError) as error:
         return console.fail(str(error))
-    sys.stdout.write(f"{path}: map {meta.map_id:08x} is called {meta.name!r}\n")
+    sys.stdout.write(f"{path}: map {meta.map_id:08x} is now named {meta.name!r}\n")
     return console.OK

@@ -20,7 +20,7 @@ def main(args: argparse.Namespace) -> int:
         return convert.export(args)
     if args.tum or args.carmen:
         return console.fail(
-            f"{args.log}: --tum and --carmen are of map files; `lumiloop replay` writes a log's trajectory"
+            f"{args.log}: --tum and --carmen need a map file; `lumiloop replay` writes the trajectory of a log"
         )
     return replay.command(args, partial(_write, args.margin))
 

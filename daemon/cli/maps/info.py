@@ -83,8 +83,8 @@ def verify(args: argparse.Namespace) -> int:
             bad += 1
             console.say(stored)
         else:
-            torn = f", {stored.isolated} submaps joined with the rest by nothing" if stored.isolated else ""
-            sys.stdout.write(f"{path}: good, map {stored.meta.map_id:08x}{torn}\n")
+            torn = f", {stored.isolated} submaps without an edge to the others" if stored.isolated else ""
+            sys.stdout.write(f"{path}: valid, map {stored.meta.map_id:08x}{torn}\n")
     return console.FAILED if bad else console.OK
 
 
@@ -93,7 +93,7 @@ def _read(path: Path) -> Stored | str:
     try:
         return read(path.read_bytes())
     except OSError as error:
-        return f"{path}: cannot be read: {said(error)}; name a map file, *.lumimap"
+        return f"{path}: cannot read the map: {said(error)}; name a map file, *.lumimap"
     except BadMap as error:
         return f"{path}: {error}; {error.advice}"
 

@@ -28,17 +28,17 @@ DONE: Final = {
     CommandCode.RELOCALISE: "search ended",
     CommandCode.SAVE_MAP: "map saved and read back",
     CommandCode.SWITCH_MAP: "map switched",
-    CommandCode.PAUSE: "paused: the lidar does not move the pose, and the map does not change",
+    CommandCode.PAUSE: "paused: the lidar does not correct the pose, and the map does not change",
     CommandCode.RESUME: "pause ended",
-    CommandCode.DUMP_RECORDER: "flight recorder written to the disk",
+    CommandCode.DUMP_RECORDER: "flight recorder content written to the disk",
 }
 """Text of an order that was carried out."""
 NOT_DONE: Final = {
     "refused": "refused",
     "running": "not finished",
-    "replaced": "replaced by a newer order of another client",
-    "no end seen": "not finished in time; the order stays in force",
-    "unknown": "not known to this daemon",
+    "replaced": "replaced by a newer command of another client",
+    "no result received": "not finished in time; the command continues",
+    "unknown": "unknown to this daemon",
 }
 """Texts of the other results."""
 
@@ -92,7 +92,7 @@ def map_id_of(text: str) -> int:
     except ValueError:
         number = -1
     if not 0 < number < 1 << 32:
-        raise ValueError(f"{text}: name a map by its eight hexadecimal digits (`lumiloop map info FILE`), or its file")
+        raise ValueError(f"{text}: not a map; give eight hexadecimal digits (`lumiloop map info FILE`) or a file")
     return number
 
 
@@ -123,12 +123,12 @@ def _by_modbus(address: str, settings: Config, request: Request, longest_s: floa
             reading = reader.read()
             while result == "done" and request.code is CommandCode.RELOCALISE and reading["state"] in GUESSED:
                 if time.monotonic() > end:
-                    result = "no end seen"
+                    result = "no result received"
                 time.sleep(POLL_S)
                 reading = reader.read()
     except (NoAnswer, command_client.CommandRefused) as error:
         raise NotGiven(str(error)) from None
-    reason = f"the log of the daemon at {host}:{port} says why" if result == "refused" else ""
+    reason = f"the log of the daemon at {host}:{port} gives the cause" if result == "refused" else ""
     reply = {"schema": SCHEMA, "command": request.code.name.lower(), "result": result, "reason": reason}
     names = ("x_m", "map_x"), ("y_m", "map_y"), ("yaw_rad", "map_yaw")
     pose = None if reading["map_x"] is None else {name: reading[register] for name, register in names}
@@ -141,7 +141,7 @@ def _state(reply: dict[str, Any]) -> str:
         return ""
     said = f"; state {reply['state']}"
     if reply["state"] in (state.name for state in GUESSED):
-        said += " (the place is not confirmed yet)"
+        said += " (the pose is not confirmed yet)"
     if (pose := reply.get("pose")) is not None:
         said += f", x {pose['x_m']:.3f} m, y {pose['y_m']:.3f} m, yaw {math.degrees(pose['yaw_rad']):.2f} deg"
     return said

@@ -34,11 +34,11 @@ def give(name: str, request: Request, longest_s: float) -> dict[str, Any]:
             reply = _line(sock, time.monotonic() + longest_s)
         except TimeoutError:
             raise NotGiven(
-                f"not finished after {longest_s:g} s; the order stays in force, `lumiloop status` shows the state"
+                f"not finished after {longest_s:g} s; the command continues, and `lumiloop status` shows the state"
             ) from None
         except PermissionError:
             raise NotGiven(
-                f"{path}: only the daemon's own user and group may give orders: use sudo, or --host where "
+                f"{path}: only the daemon's user and group may send commands; use sudo, or --host if "
                 "`modbus.write` is true"
             ) from None
         except OSError as error:
@@ -46,9 +46,9 @@ def give(name: str, request: Request, longest_s: float) -> dict[str, Any]:
     try:
         answer = json.loads(reply)
     except ValueError:
-        raise NotGiven(f"{path}: the daemon has closed the connection; read its log") from None
+        raise NotGiven(f"{path}: the daemon closed the connection; read its log") from None
     if not isinstance(answer, dict) or "result" not in answer:
-        raise NotGiven(f"{path}: the reply is not that of a lumiloop daemon")
+        raise NotGiven(f"{path}: the reply is not from a lumiloop daemon")
     return answer
 
 
@@ -69,5 +69,5 @@ def _others(name: str) -> str:
     folders = dict.fromkeys((runtime_folder(), SERVICE))
     others = sorted({other for folder in folders for other in daemons_in(Path(folder))} - {name})
     if others:
-        return f"no daemon is named {name}; these run: {', '.join(others)} (--set name=NAME, or --config)"
-    return "no daemon runs: start `lumiloop run`"
+        return f"no daemon has the name {name}; running daemons: {', '.join(others)} (--set name=NAME, or --config)"
+    return "no daemon runs; start one with `lumiloop run`"

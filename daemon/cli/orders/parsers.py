@@ -18,12 +18,12 @@ NEGATIVE: Final = re.compile(r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?(rad|deg)?")
 Commands = argparse._SubParsersAction  # what add_subparsers() gives; argparse has no public name for it
 
 SIMPLE: Final = (
-    ("relocalise", "RELOCALISE", "search the whole map for the robot, which was carried away"),
+    ("relocalise", "RELOCALISE", "search the whole map for the pose, for example after the robot was moved by hand"),
     ("save-map", "SAVE_MAP", "write the map to the disk now"),
     ("reset", "RESET", "forget pose and map, and begin a new map; stored maps remain"),
     ("pause", "PAUSE", "stop using the lidar and changing the map, until `resume`"),
     ("resume", "RESUME", "end a pause"),
-    ("dump", "DUMP_RECORDER", "write the flight recorder's content to the disk"),
+    ("dump", "DUMP_RECORDER", "write the content of the flight recorder to the disk"),
 )
 """Orders without parameters: command, name of the order, help."""
 
@@ -36,8 +36,8 @@ def add(commands: Commands[argparse.ArgumentParser]) -> None:
     pose.add_argument("yaw", type=heading, metavar="YAW", help="degrees, counter-clockwise; or radians, as in 1.57rad")
     pose._negative_number_matcher = NEGATIVE  # argparse's own accepts neither units nor exponents
     _order(pose, "SET_POSE")
-    switch = commands.add_parser("switch-map", help="go on in another stored map")
-    switch.add_argument("map", metavar="MAP", help="its eight hexadecimal digits (`lumiloop map info`), or its file")
+    switch = commands.add_parser("switch-map", help="switch to another stored map")
+    switch.add_argument("map", metavar="MAP", help="eight hexadecimal digits (`lumiloop map info`), or a file")
     _order(switch, "SWITCH_MAP")
     for word, name, text in SIMPLE:
         _order(commands.add_parser(word, help=text), name)
@@ -47,14 +47,14 @@ def _order(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument(
         "--host",
         metavar="HOST[:PORT]",
-        help="a daemon elsewhere, over Modbus UDP; it needs `modbus.write = true`. Default: this computer's own",
+        help="daemon on another computer, over Modbus UDP (needs `modbus.write = true`); default: this computer",
     )
     parser.add_argument(
         "--timeout",
         type=_seconds,
         default=TIMEOUT_S,
         metavar="S",
-        help=f"wait no longer for the result; default: {TIMEOUT_S:g}",
+        help=f"longest wait for the result; default: {TIMEOUT_S:g}",
     )
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     config_arguments(parser)
@@ -98,5 +98,5 @@ def _finite(number: str, text: str) -> float:
 def _seconds(text: str) -> float:
     seconds = _finite(text, text)
     if not 0.0 < seconds <= LONGEST_S:
-        raise argparse.ArgumentTypeError(f"{text} s: name more than 0 and at most {LONGEST_S:g}")
+        raise argparse.ArgumentTypeError(f"{text} s: out of range; give more than 0 and at most {LONGEST_S:g}")
     return seconds

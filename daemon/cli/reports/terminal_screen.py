@@ -44,7 +44,9 @@ class Screen:
             shown = lines[self._first : self._first + room - 1]
             last = self._first + len(shown)
             shown.append(
-                f"-- lines {self._first + 1} to {last} of {len(lines)}; scroll: arrows, space, b; quit: q"[:columns]
+                f"-- lines {self._first + 1} to {last} of {len(lines)}; scroll with arrows, space and b, quit with q"[
+                    :columns
+                ]
             )
         else:
             self._first, shown = 0, lines

@@ -41,15 +41,15 @@ def load(path: Path) -> tuple[Description, Trinary]:
     except OSError as error:
         raise BadMapServer(f"{path}: cannot be read: {error.strerror}; name map_server's YAML file") from error
     except UnicodeDecodeError as error:
-        raise BadMapServer(f"{path}: is not text; name map_server's YAML file, not the picture") from error
+        raise BadMapServer(f"{path}: not a text file; name map_server's YAML file, not the image") from error
     described = describe(path, text)
     try:
         picture = read_picture(read_regular(_within(path, described.image), MOST_IMAGE), MOST_CELLS)
     except OSError as error:
-        wrong = f"the picture {described.image} cannot be read: {error.strerror}"
-        raise BadMapServer(f"{path}: {wrong}; put it there, or correct `image`") from error
+        wrong = f"the image {described.image} cannot be read: {error.strerror}"
+        raise BadMapServer(f"{path}: {wrong}; copy it there, or correct `image`") from error
     except FileRefused as error:
-        raise BadMapServer(f"{path}: the picture {described.image} {error}; correct `image`") from error
+        raise BadMapServer(f"{path}: the image {described.image} {error}; correct `image`") from error
     except BadPicture as error:
         raise BadMapServer(f"{described.image}: {error}") from error
     return described, cells_of(described, picture)
@@ -72,7 +72,7 @@ def _within(path: Path, image: Path) -> Path:
     except RuntimeError:
         raise FileRefused("is a link that leads to itself") from None
     if not found.is_relative_to(base):
-        raise FileRefused(f"is a link out of its folder, to {found}; copy it there")
+        raise FileRefused(f"is a link to {found} outside its folder; copy the file instead")
     return found
 
 

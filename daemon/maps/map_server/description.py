@@ -54,10 +54,10 @@ def describe(path: Path, text: str) -> Description:
     fields = _fields(path, text)
     for key in ("image", "resolution", "origin"):
         if key not in fields:
-            raise BadMapServer(f"{path}: has no `{key}`; map_server's files have one")
+            raise BadMapServer(f"{path}: `{key}` is missing; map_server's files have one")
     image = fields["image"]
     if not isinstance(image, str) or not image or "\0" in image:
-        raise BadMapServer(f"{path}: `image` must be the name of a picture")
+        raise BadMapServer(f"{path}: `image` must be the name of an image file")
     resolution = _number(path, "resolution", fields["resolution"])
     if not 0.001 <= resolution <= 1.0:
         raise BadMapServer(f"{path}: `resolution` is {resolution:g} m per pixel; it must be 0.001 to 1")

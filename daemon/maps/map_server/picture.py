@@ -82,13 +82,13 @@ def _converted(image: Image) -> Picture:
 def _pgm(data: bytes, most: int) -> Picture:
     head = _PGM.match(data[:_HEAD])
     if head is None:
-        raise BadPicture("its head is not that of a PGM: P5 or P2, columns, rows, largest value")
+        raise BadPicture("its head is not a PGM head: P5 or P2, columns, rows, largest value")
     if max(len(head[at]) for at in (3, 5, 7)) > 9:
         raise BadPicture("its head has a number that is too large")
     columns, rows, largest = int(head[3]), int(head[5]), int(head[7])
     check_size(columns, rows, most)
     if not 0 < largest < 65536:
-        raise BadPicture(f"its largest value is said to be {largest}; 1 to 65535 can be")
+        raise BadPicture(f"its largest value is {largest}; expected 1 to 65535")
     count = rows * columns
     values = _decimals(data[head.end() :], count) if head[1] == b"2" else _bytes(data[head.end() + 1 :], largest)
     if len(values) < count:
@@ -112,7 +112,7 @@ def _decimals(data: bytes, count: int) -> npt.NDArray[Any]:
     """Whole numbers in text, up to ``count`` of them."""
     text = re.sub(rb"#[^\n]*", b"", data)
     if text.translate(None, b"0123456789 \t\n\r\v\f"):
-        raise BadPicture("holds something else than whole numbers; export it again")
+        raise BadPicture("contains text that is not a whole number; export it again")
     if not text.strip():
         return np.empty(0, np.int64)
     try:

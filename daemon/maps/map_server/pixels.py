@@ -46,4 +46,4 @@ class Picture:
 def check_size(columns: int, rows: int, most: int, remedy: str = "") -> None:
     """Raise `BadPicture` for an image of more than ``most`` pixels, or none."""
     if columns < 1 or rows < 1 or columns * rows > most:
-        raise BadPicture(f"is said to be {columns} x {rows} pixels; 1 to {most} can be read{remedy}")
+        raise BadPicture(f"has {columns} x {rows} pixels; the limit is {most}{remedy}")

@@ -43,7 +43,7 @@ def read_png(data: bytes) -> Picture:
     except zlib.error as error:
         raise BadPicture(f"its pixels cannot be unpacked ({error}); copy it again") from None
     if len(packed) != rows * (wide + 1):
-        raise BadPicture("has fewer or more pixels than it says; copy it again")
+        raise BadPicture("has fewer or more pixels than its head states; copy it again")
     lines = np.frombuffer(packed, np.uint8).reshape(rows, wide + 1)
     values = _values(_unfiltered(lines, max(1, channels * depth // 8)), depth, columns * channels)
     return _shaded(values.reshape(rows, columns, channels), depth, colour, chunks)
@@ -55,7 +55,7 @@ def _shaded(values: npt.NDArray[np.uint16], depth: int, colour: int, chunks: dic
     table = np.frombuffer(chunks.get("PLTE", b""), np.uint8)
     table = table[: len(table) // 3 * 3].reshape(-1, 3)
     if values.max() >= len(table):
-        raise BadPicture("uses colours that its palette does not have; save it again")
+        raise BadPicture("uses colours outside its palette; save it again")
     told = np.frombuffer(chunks.get("tRNS", b""), np.uint8)[: len(table)]
     if len(told):
         clear = np.full((len(table), 1), 255, np.uint8)
@@ -100,7 +100,7 @@ def _unfiltered(lines: npt.NDArray[np.uint8], step: int) -> npt.NDArray[np.uint8
         elif kind in (3, 4):
             out[row] = _along(raw.tolist(), above.tolist(), step, kind)
         else:
-            raise BadPicture(f"names a filter, {kind}, that does not exist; save it again")
+            raise BadPicture(f"uses the unknown filter {kind}; save it again")
     return out[1:]
 
 

@@ -74,7 +74,7 @@ class _Parser:
     def _count(self, depth: int) -> None:
         self._nodes += 1
         if depth > DEEPEST or self._nodes > MOST_NODES:
-            raise self._bad("has more than a map description has")
+            raise self._bad("has more content than a map description")
 
     def _block(self, parent: int, depth: int) -> Node:
         """The block node that is indented further than ``parent``; empty text without one."""
@@ -113,7 +113,7 @@ class _Parser:
                 raise self._bad("is not `key: value`")
             key, value = split
             if key in fields:
-                raise self._bad(f"says `{key}` a second time")
+                raise self._bad(f"repeats `{key}`")
             self._at += 1
             following = self._next() if not value else None
             dashed = following is not None and following[0] == indent and (following[1] + " ").startswith("- ")
@@ -148,12 +148,12 @@ class _Parser:
             while (end := extent.end(text)) < 0:
                 if self._at >= len(self._lines):
                     what = "the list or mapping" if text[0] in "[{" else "the quoted text"
-                    raise self._bad(f"begins {what} that has no end", begun)
+                    raise self._bad(f"begins {what} without an end", begun)
                 line = self._lines[self._at]
                 text += "\n" + (line.strip() if text[0] in "'\"" else _uncommented(line).strip())
                 self._at += 1
             if text[end:].strip():
-                raise self._bad("goes on behind its value", self._at - 1)
+                raise self._bad("continues after its value", self._at - 1)
             return self._flow(_Cursor(text[:end]), depth) if text[0] in "[{" else _unquoted(text[:end])
         while (found := self._next()) is not None and found[0] > indent:
             if _key_of(found[1]) is not None:
@@ -164,7 +164,7 @@ class _Parser:
 
     def _alias(self, name: str, depth: int) -> Node:
         if name not in self._anchors:
-            raise self._bad("names an anchor that is not there", self._at - 1)
+            raise self._bad("names an anchor that does not exist", self._at - 1)
         for _ in range(_size(self._anchors[name])):
             self._count(depth)
         return self._anchors[name]
@@ -194,7 +194,7 @@ class _Parser:
             node = self._flow_collection(cursor, begin, depth)
         elif begin in ("'", '"'):
             if (size := _Extent().end(cursor.rest())) < 0:
-                raise self._bad("begins the quoted text that has no end", self._at - 1)
+                raise self._bad("begins a quoted text without an end", self._at - 1)
             node = _unquoted(cursor.take(size))
         else:
             plain = re.match(r"(?:[^,\[\]{}:]|:(?![\s,\[\]{}]|$))*", cursor.rest())
@@ -215,7 +215,7 @@ class _Parser:
             node = self._flow(cursor, depth + 1)
             if begin == "{":
                 if not isinstance(node, str) or node in fields:
-                    raise self._bad(f"says `{node}` a second time", self._at - 1)
+                    raise self._bad(f"repeats `{node}`", self._at - 1)
                 value: Node = ""
                 if cursor.skip() == ":":
                     cursor.at += 1
@@ -349,9 +349,9 @@ def _escaped(match: re.Match[str]) -> str:
         try:
             return chr(int(code[1:], 16))
         except (ValueError, OverflowError):
-            raise BadYaml(f"has `\\{code}`, which is no character") from None
+            raise BadYaml(f"has `\\{code}`, which is not a character") from None
     if code not in _ESCAPES:
-        raise BadYaml(f"has `\\{code}`, which is no escape of YAML")
+        raise BadYaml(f"has `\\{code}`, which is not a YAML escape")
     return _ESCAPES[code]
 
 

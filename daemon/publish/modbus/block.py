@@ -55,7 +55,7 @@ class Block(Layout):
             raise ValueError(f"the block of {self.name} has {self.registers} registers, got {len(block) / 2:g}")
         magic, version = _HEAD.unpack_from(block)
         if magic != self.magic or version != self.version:
-            known = f"this reader knows {self.magic:#06x} and {self.version}"
+            known = f"this reader needs {self.magic:#06x} and {self.version}"
             raise ValueError(f"magic {magic:#06x} and version {version} of the block of {self.name}; {known}")
         raw = self.big.unpack_from(block, _HEAD.size)
         (seq_end,) = _END.unpack_from(block, len(block) - _END.size)

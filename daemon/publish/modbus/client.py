@@ -69,8 +69,8 @@ class Reader:
         found = whose(self._name, *self._sock.getpeername()[:2])
         if found.another:
             raise NoAnswer(
-                f"{self._where} is answered by {found}, not by `{self._name}` (process {found.meant}), which cannot "
-                f"have the port: give one of them another modbus.port; `lumiloop status {self._where}` shows that one"
+                f"{self._where} belongs to {found}, not to `{self._name}` (process {found.meant}); give one "
+                f"of them another `modbus.port`, or use `lumiloop status {self._where}` for that one"
             )
         return found
 
@@ -87,8 +87,8 @@ class Reader:
                 continue
             except OSError as error:
                 raise NoAnswer(
-                    f"{self._where}: {error.strerror}; nothing serves Modbus there: start `lumiloop run`, or name the "
-                    "right HOST:PORT"
+                    f"{self._where}: {error.strerror}; no Modbus server runs there. Start `lumiloop run`, or "
+                    "correct HOST:PORT"
                 ) from error
             reading = self._reading(answer)
             for block in BLOCKS:
@@ -96,8 +96,8 @@ class Reader:
                     reading |= self._block(block)
             return reading
         raise NoAnswer(
-            f"{self._where}: no answer within {_TRIES * _TIMEOUT_S:g} s; check that the daemon runs, that its `bind` "
-            "is not the loopback address of another computer, and that no firewall drops UDP"
+            f"{self._where}: no answer within {_TRIES * _TIMEOUT_S:g} s; check that the daemon runs, that its "
+            "`bind` is reachable from here, and that no firewall blocks UDP"
         )
 
     def _block(self, block: Block) -> Reading:
@@ -125,7 +125,7 @@ class Reader:
 
     def _reading(self, answer: bytes) -> Reading:
         if len(answer) == _ANSWER.size and answer[7] & 0x80:
-            raise NoAnswer(f"{self._where}: Modbus exception {answer[8]}; that is another kind of device")
+            raise NoAnswer(f"{self._where}: Modbus exception {answer[8]}; this is another kind of device")
         try:
             return registers.decode_block(answer[_ANSWER.size :])
         except ValueError as error:

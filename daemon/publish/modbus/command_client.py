@@ -65,13 +65,13 @@ class CommandClient(asyncio.DatagramProtocol):
                 if done:
                     break
             else:
-                raise CommandRefused("the daemon's Modbus server does not answer: is `modbus.port` as in its file?")
+                raise CommandRefused("the Modbus server of the daemon does not answer; check `modbus.port`")
         finally:
             del self._pending[transaction]
         received: bytes = response.result()
         if received[0] & 0x80:
             raise CommandRefused(
-                f"the daemon takes no orders (Modbus exception {received[1]}): set `modbus.write = true`"
+                f"the daemon accepts no commands (Modbus exception {received[1]}); set `modbus.write = true`"
             )
         return received
 
@@ -111,7 +111,7 @@ class CommandClient(asyncio.DatagramProtocol):
             if ended:
                 return result.name.lower()
             await asyncio.sleep(POLL_S)
-        return "no end seen"
+        return "no result received"
 
     async def require_owner(self, daemon: str | Path) -> None:
         """Check that the server belongs to the daemon with this name or stream; passes where that cannot be determined.
@@ -124,7 +124,7 @@ class CommandClient(asyncio.DatagramProtocol):
         found = await run_in_thread(partial(whose, daemon, host, port), "whose")
         if found.another:
             raise CommandRefused(
-                f"{host}:{port} is answered by {found}, not by the daemon that is meant (process {found.meant}): name "
+                f"{host}:{port} belongs to {found}, not to the requested daemon (process {found.meant}); name "
                 "its configuration with --config, or give one of them another `modbus.port`"
             )
 
@@ -175,7 +175,7 @@ def pose_registers(pose: tuple[float, float, float]) -> bytes:
     try:
         return struct.pack(">iii", *(round(scale * value) for scale, value in zip(STEPS, pose, strict=True)))
     except (struct.error, OverflowError, ValueError):
-        raise CommandRefused("the registers hold poses within 200000 m and 2000 rad") from None
+        raise CommandRefused("the pose is out of range; registers hold poses within 200000 m and 2000 rad") from None
 
 
 async def switch_map(name: str, host: str, port: int, map_id: int) -> str:

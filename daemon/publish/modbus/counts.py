@@ -14,11 +14,11 @@ from hal.net.peers import most_of
 log = logging.getLogger(__name__)
 
 MAX_CONNECTIONS: Final = 32
-STRANGE: Final = "sends what is no Modbus request; it is dropped, and a connection closed"
+STRANGE: Final = "sends data that is not a Modbus request; the daemon drops it and closes the connection"
 PER_HOST: Final = most_of(MAX_CONNECTIONS)
 """Connections that one host may have."""
-GREEDY: Final = f"is not served: it has {PER_HOST} of the {MAX_CONNECTIONS} connections open and in use, close one"
-CROWDED: Final = f"is not served: {MAX_CONNECTIONS} connections are open and in use, close one"
+GREEDY: Final = f"is rejected, because it uses {PER_HOST} of the {MAX_CONNECTIONS} connections; close one"
+CROWDED: Final = f"is rejected, because all {MAX_CONNECTIONS} connections are in use; close one"
 Allowed = Callable[[str], bool]
 
 

@@ -82,11 +82,11 @@ def _parameters(text: str) -> tuple[Point, ...]:
 
 COMMAND: Final = Layout(
     (
-        _point("request", "request number", "A number other than the last starts the command; write it last, or all in "
-               "one request. Begin with 1: 0, which stands there after a start, is acknowledged before it is asked."),
+        _point("request", "request number", "A number other than the last one starts the command. Write it last, "
+            "or all in one request. Begin with 1, because 0 is acknowledged after a start."),
         _point("command", "command", f"{_CODES}."),
         *_parameters("map frame, for SET_POSE"),
-        _point("acknowledge", "acknowledge number", "The number of the last request that was finished.", "R"),
+        _point("acknowledge", "acknowledge number", "Number of the last finished request.", "R"),
         _point("result", "result", f"Of the last request: {_OUTCOMES}.", "R"),
         Point("map_id", "map", U32, from_client, "For SWITCH_MAP: the stored map's identity; written before the "
               "request.", can_be_unknown=False, access="RW"),
@@ -97,16 +97,17 @@ _WRITABLE: Final = ((0, _ANSWER_AT), (_ANSWER_AT + 2, COMMAND.words))
 
 LOOP: Final = Layout(
     (
-        _point("loop_seen", "loop closures seen", "Write the `loop_counter` that was read: the bit `loop_latched` of "
-               "`flags` is clear until the next loop."),
+        _point("loop_seen", "loop closures seen", "Write the `loop_counter` that was read. The bit "
+            "`loop_latched` of `flags` is then clear until the next loop."),
     )
 )  # fmt: skip
 
 ODOMETRY: Final = Layout(
     (
-        _point("number", "reading number", "Must change with each reading; 0 says that the odometry was restarted and "
-               "its pose begins anew (1 follows 65535)."),
-        Point("age", "age when written", U16, from_client, "Not known: as old as the write.", 10_000, "s", access="RW"),
+        _point("number", "reading number", "Must change with each reading. 0: odometry was restarted and its "
+            "pose begins again (1 follows 65535)."),
+        Point("age", "age when written", U16, from_client, "Not known: the time of the write counts.", 10_000, "s",
+          access="RW"),
         *_parameters("odometry frame, cumulative"),
     )
 )  # fmt: skip

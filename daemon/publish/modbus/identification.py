@@ -47,7 +47,7 @@ def identify(objects: Objects, body: bytes) -> ModbusPDU:
     if len(body) > 1 and body[1] != MEI_TYPE:
         return ExceptionResponse(READ_DEVICE_IDENTIFICATION, ExcCodes.ILLEGAL_FUNCTION)
     if len(body) != _SIZE:
-        raise ValueError("a request for the device identification has four bytes")
+        raise ValueError("a request for the device identification must have four bytes")
     access, first = DeviceInformation(body[2]), body[3]
     if access is DeviceInformation.SPECIFIC:
         if first not in objects:

@@ -20,10 +20,10 @@ from daemon.snapshot import LoopReason, Snapshot
 Bit = tuple[str, str, Callable[[Snapshot], bool]]
 
 WITNESSES: Final[tuple[Bit, ...]] = (
-    ("laser_bounds", "the bound rests on the laser", lambda s: s.trust.laser),
-    ("light_bounds", "the bound rests on light", lambda s: s.trust.light),
-    ("wheels_bound", "the bound rests on wheel odometry, which laser and light share", lambda s: s.trust.wheels),
-    ("alert", "the bound is above the limit that is set, or there is none", lambda s: s.trust.alert),
+    ("laser_bounds", "the protection level uses the lidar solution", lambda s: s.trust.laser),
+    ("light_bounds", "the protection level uses the light solution", lambda s: s.trust.light),
+    ("wheels_bound", "the protection level uses odometry, which lidar and light share", lambda s: s.trust.wheels),
+    ("alert", "the protection level is above the alert limit, or there is none", lambda s: s.trust.alert),
 )
 
 
@@ -37,24 +37,25 @@ def _gap(snapshot: Snapshot) -> Value:
 
 
 _REASONS: Final = ", ".join(f"{reason.value} {reason.name}" for reason in LoopReason)
-_BOUND: Final = "Rounded up; the largest value means this or more. Not known: there is no bound, the error may be any."
+_BOUND: Final = "Rounded up; the largest value means this or more. Not known: there is no protection level."
 
 POINTS: Final = (
-    Point("protection", "protection level", U16, attrgetter("trust.horizontal_m"), "Bound on the horizontal error of "
-          f"the map pose. {_BOUND}", 1_000, "m", ceil=True),
+    Point("protection", "protection level", U16, attrgetter("trust.horizontal_m"),
+          f"Horizontal, of the map pose. {_BOUND}", 1_000, "m", ceil=True),
     Point("protection_yaw", "protection level of the heading", U16, attrgetter("trust.yaw_rad"), _BOUND, 10_000, "rad",
           ceil=True),
-    Point("alert_limit", "alert limit", U16, attrgetter("trust.limit_m"), "`integrity.alert_m`. Not known: none is "
-          "set.", 1_000, "m"),
-    Point("witnesses", "what the bound rests on", U16, _witnesses, "Bits, see below.", can_be_unknown=False),
-    Point("witness_gap", "gap between the witnesses", U16, _gap, "Distance between the pose and the one from light "
-          "alone, in standard deviations. Not known: one of them is missing.", 100),
-    Point("places", "places that fit", U16, attrgetter("trust.places"), "While the place is looked for: 0 none yet, 1 "
-          "is being confirmed, more than 1 ambiguous. Not known: the place is known."),
-    Point("loop_reason", "loop closure, why", U16, attrgetter("loop_reason"), f"{_REASONS}. Not known before the "
+    Point("alert_limit", "alert limit", U16, attrgetter("trust.limit_m"),
+          "`integrity.alert_m`. Not known: no limit is set.", 1_000, "m"),
+    Point("witnesses", "solutions behind the protection level", U16, _witnesses, "Bits, see below.",
+          can_be_unknown=False),
+    Point("witness_gap", "normalised separation", U16, _gap,
+          "Distance between pose and light solution, in standard deviations. Not known: one of them is missing.", 100),
+    Point("places", "number of hypotheses", U16, attrgetter("trust.places"), "During relocalisation: 0 none yet, 1 "
+        "waits for confirmation, more than 1 ambiguous. Not known: the pose is known."),
+    Point("loop_reason", "loop closure, reason", U16, attrgetter("loop_reason"), f"{_REASONS}. Not known before the "
           "first."),
-    Point("loop_residual", "loop closure, residual", U16, attrgetter("loop_residual"), "RMS distance of the beams that "
-          "fit. Not known before the first.", 10_000, "m", ceil=True),
+    Point("loop_residual", "loop closure, residual", U16, attrgetter("loop_residual"),
+          "RMS distance of the inlier beams. Not known before the first.", 10_000, "m", ceil=True),
 )  # fmt: skip
 
 BLOCK: Final = Block("integrity", 340, "LP", 1, POINTS)

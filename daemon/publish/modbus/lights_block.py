@@ -72,17 +72,17 @@ _SIGMA: Final = "One standard deviation, rounded up; the largest value means thi
 def _estimate() -> tuple[Point, ...]:
     """Points of the light solution's position, in the same order in the block and in the datagram."""
     return (
-        Point("light_fix", "fix from lights alone", U16, _light("fix"), f"{_FIXES}. Not known: no photodiode."),
-        Point("light_used", "links used", U16, _light("used"), "Lamps that the fix rests on."),
-        Point("light_x", "position x, from lights alone", I32, _part("pose", 0), "Map frame, without the laser.",
+        Point("light_fix", "state of the light filter", U16, _light("fix"), f"{_FIXES}. Not known: no photodiode."),
+        Point("light_used", "links used", U16, _light("used"), "Lamps in the light solution."),
+        Point("light_x", "position x, light solution", I32, _part("pose", 0), "Map frame, without the lidar.",
               10_000, "m"),
-        Point("light_y", "position y, from lights alone", I32, _part("pose", 1), "Map frame.", 10_000, "m"),
-        Point("light_yaw", "heading, from lights alone", I32, _yaw, "Map frame, in [-pi, pi].", 1_000_000, "rad"),
+        Point("light_y", "position y, light solution", I32, _part("pose", 1), "Map frame.", 10_000, "m"),
+        Point("light_yaw", "heading, light solution", I32, _yaw, "Map frame, in [-pi, pi].", 1_000_000, "rad"),
         Point("light_sigma_x", "sigma of light_x", U16, _part("sigma", 0), _SIGMA, 10_000, "m", ceil=True),
         Point("light_sigma_y", "sigma of light_y", U16, _part("sigma", 1), _SIGMA, 10_000, "m", ceil=True),
         Point("light_sigma_yaw", "sigma of light_yaw", U16, _part("sigma", 2), _SIGMA, 10_000, "rad", ceil=True),
-        Point("light_age", "age of the light", U16, _age, "From the end of the latest block of samples that could be "
-              "used to the instant this was sent.", 10_000, "s"),
+        Point("light_age", "age of the light", U16, _age,
+          "From the end of the latest usable block of samples to the time of sending.", 10_000, "s"),
     )  # fmt: skip
 
 
@@ -91,13 +91,13 @@ def _row(row: int) -> tuple[Point, ...]:
     return (
         Point(f"{name}_code", f"{label}, code", U16, _of_link(row, "code"), "Number of the CDMA code as received. Not "
               "known: no further link."),
-        Point(f"{name}_lamp", f"{label}, lamp", U16, _of_link(row, "lamp_id"), "Number of the lamp. Not known: no lamp "
-              "of this code is known, or it is not clear which."),
+        Point(f"{name}_lamp", f"{label}, lamp", U16, _of_link(row, "lamp_id"),
+          "Number of the lamp. Not known: no lamp has this code, or several have it."),
         Point(f"{name}_use", f"{label}, use", U16, _of_link(row, "use"), "See below."),
         Point(f"{name}_strength", f"{label}, strength", U32, _of_link(row, "strength"), "Amplitude of the modulated "
               "photocurrent.", 10**12, "A"),
-        Point(f"{name}_residual", f"{label}, residual", I16, _of_link(row, "residual"), "Natural logarithm of received "
-              "over expected strength.", 10_000),
+        Point(f"{name}_residual", f"{label}, residual", I16, _of_link(row, "residual"),
+          "Natural logarithm of received over expected RSS.", 10_000),
     )  # fmt: skip
 
 
@@ -105,13 +105,14 @@ BLOCK: Final = Block(
     "lights", 200, "LI", 1,
     (
         *_estimate(),
-        Point("light_floor", "diffuse light", U16, _light("floor"), "Part of a lamp's own strength below it.", 10_000),
-        Point("sample_clock", "error of the sample clock", I16, _light("clock_ppm"), "Parts per million; not known "
-              "until lamps have confirmed it."),
+        Point("light_floor", "diffuse light", U16, _light("floor"), "Share of a lamp's RSS at its nadir.", 10_000),
+        Point("sample_clock", "error of the sample clock", I16, _light("clock_ppm"),
+          "Parts per million. Not known before lamps confirm it."),
         Point("blocks", "blocks of samples", U32, _count("blocks"), "Received since the start.", rule=Rule.WRAP,
               can_be_unknown=False),
-        Point("blocks_lost", "blocks without use", U32, _count("blocks_lost"), "Dropped, damaged, or without a cycle "
-              "that could take them, since the start.", rule=Rule.WRAP, can_be_unknown=False),
+        Point("blocks_lost", "unused blocks", U32, _count("blocks_lost"),
+          "Dropped, damaged, or without a cycle to process them, since the start.", rule=Rule.WRAP,
+          can_be_unknown=False),
         *(point for row in range(LISTED_LINKS) for point in _row(row)),
     ),
 )  # fmt: skip

@@ -19,26 +19,26 @@ FAULTS: Final = 12
 """Largest number of faults that the block lists; more are only counted."""
 
 PARTS: Final = {
-    Part.LIDAR: "the lidar's driver: streams begun anew, and ports",
-    Part.PHOTODIODE: "the converter's driver: times it delivered again after trouble",
-    Part.ODOMETRY: "the port that takes odometry",
-    Part.IMU: "the port that takes gyro readings",
-    Part.MODBUS: "the Modbus server on UDP and TCP",
-    Part.RTU: "the Modbus server on a serial line",
-    Part.POSE: "the sender of pose datagrams",
-    Part.SUBSCRIPTIONS: "the port at which pose datagrams are subscribed",
+    Part.LIDAR: "lidar driver: restarts of stream and port",
+    Part.PHOTODIODE: "converter driver: recoveries",
+    Part.ODOMETRY: "port for odometry",
+    Part.IMU: "port for gyro readings",
+    Part.MODBUS: "Modbus server on UDP and TCP",
+    Part.RTU: "Modbus server on a serial line",
+    Part.POSE: "sender of pose datagrams",
+    Part.SUBSCRIPTIONS: "port for subscriptions to pose datagrams",
     Part.STREAM: "the local stream",
-    Part.MAP: "the keeper of the map",
+    Part.MAP: "autosave of the map",
     Part.OTHER: "anything else",
 }
 """Meaning of the components, by number. Part of the contract: never renumber."""
 THREADS: Final = {
-    Thread.SOLVER: "a computation that the pose waits for; after two minutes the watchdog ends the daemon",
+    Thread.SOLVER: "a computation that the pose needs; after two minutes the watchdog ends the daemon",
     Thread.SEARCH: "a search in the background; after two minutes the watchdog ends the daemon",
-    Thread.MAP: "a save of the map: look at the disk",
-    Thread.POSE: "what keeps the pose for the next start: look at the disk",
-    Thread.RECORDING: "the recording: look at the disk",
-    Thread.I2C: "a transaction on the photodiode's bus: look at the bus",
+    Thread.MAP: "saving the map: check the disk",
+    Thread.POSE: "storing the pose for the next start: check the disk",
+    Thread.RECORDING: "the recording: check the disk",
+    Thread.I2C: "a transaction on the photodiode's bus: check the bus",
 }
 """Meaning of the threads, by number. Part of the contract: never renumber."""
 
@@ -74,9 +74,9 @@ POINTS: Final = (
     Point("uptime", "time since the start", U32, lambda s: _condition(s).uptime_s, "Of the process.",
           unit="s", can_be_unknown=False),
     Point("faults", "faults present", U16, lambda s: len(_condition(s).faults),
-          "The gravest are named below, each before those that follow from it.", can_be_unknown=False),
+          "The gravest are listed below, each before those that follow from it.", can_be_unknown=False),
     *(
-        Point(f"fault_{k + 1}", "fault" if k else "gravest fault", U16, _fault(k), "0: no further one.",
+        Point(f"fault_{k + 1}", "fault" if k else "gravest fault", U16, _fault(k), "0: no further fault.",
               can_be_unknown=False)
         for k in range(FAULTS)
     ),
@@ -85,10 +85,10 @@ POINTS: Final = (
               rule=Rule.WRAP, can_be_unknown=False)
         for part, text in PARTS.items()
     ),
-    Point("down", "parts that are down", U16, _bits("down"),
-          f"Bits: {_names(PARTS)}. Of the program: a device that is gone is a fault and no bit here.",
+    Point("down", "components that are down", U16, _bits("down"),
+          f"Bits: {_names(PARTS)}. Components of the program only; a missing device is a fault.",
           can_be_unknown=False),
-    Point("hanging", "threads that have not come back", U16, _bits("hanging"), f"Bits: {_names(THREADS)}.",
+    Point("hanging", "threads that do not respond", U16, _bits("hanging"), f"Bits: {_names(THREADS)}.",
           can_be_unknown=False),
 )  # fmt: skip
 

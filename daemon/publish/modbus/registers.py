@@ -98,27 +98,27 @@ Bit = tuple[str, str, Callable[[Snapshot], bool]]
 FLAGS: Final[tuple[Bit, ...]] = (
     (
         "pose_valid",
-        "there is a pose in the map frame; a guess in AMBIGUOUS, RELOCATING, LOST",
+        "there is a pose in the map frame; unconfirmed in AMBIGUOUS, RELOCATING, LOST",
         lambda s: s.pose is not None,
     ),
     ("odom_valid", "there is a pose in the odom frame", lambda s: s.odom is not None),
-    ("x_known", "x of the map pose is observed, not only carried on", lambda s: s.known[0]),
+    ("x_known", "x of the map pose is observed, not only predicted", lambda s: s.known[0]),
     ("y_known", "y of the map pose is observed", lambda s: s.known[1]),
     ("yaw_known", "the heading in the map is observed", lambda s: s.known[2]),
     (
         "loop_closed",
-        "at least one loop closure since the start; `loop_counter` tells each",
+        "at least one loop closure since the start; `loop_counter` counts them",
         lambda s: s.loop_counter > 0,
     ),
     (
         "bounded",
-        "there is a bound on the error of the map pose: `protection`",
+        "there is a protection level of the map pose: `protection`",
         lambda s: s.trust.horizontal_m is not None,
     ),
-    ("alert", "the bound is above the limit that is set, or there is none", lambda s: s.trust.alert),
+    ("alert", "the protection level is above the alert limit, or there is none", lambda s: s.trust.alert),
     (
         "loop_latched",
-        "a loop was closed since the last was acknowledged (Modbus, `loop_seen`)",
+        "a loop was closed after the last acknowledged one (Modbus, `loop_seen`)",
         lambda s: s.loop_latched,
     ),
 )
@@ -157,20 +157,21 @@ _STATES: Final = ", ".join(f"{state.value} {state.name}" for state in State)
 
 BODY: Final = Layout(
     (
-        Point("seq", "snapshot number", U32, attrgetter("seq"), "One more with every snapshot.", rule=Rule.WRAP,
+        Point("seq", "snapshot number", U32, attrgetter("seq"), "Increases by one with every snapshot.", rule=Rule.WRAP,
               can_be_unknown=False),
         Point("state", "state", U16, attrgetter("state"), f"{_STATES}.", can_be_unknown=False),
         Point("reason", "reason for the state", U16, attrgetter("reason"), "See below; 0: none.", can_be_unknown=False),
         Point("fault", "gravest present fault", U16, attrgetter("fault"), "See below; 0: none.", can_be_unknown=False),
         Point("flags", "flags", U16, _bits(FLAGS), "Bits, see below.", can_be_unknown=False),
-        Point("heartbeat", "heartbeat", U16, _heartbeat, "Ten per second of the daemon's clock; stands still when the "
-              "cycle does.", rule=Rule.WRAP, can_be_unknown=False),
-        Point("age", "age of the pose", U16, lambda s: s.t_sent - s.t_mono, "From the instant the pose is true for to "
-              "the instant this was sent.", 10_000, "s"),
+        Point("heartbeat", "heartbeat", U16, _heartbeat,
+          "Ten per second of the daemon's clock; stops when the cycle stops.", rule=Rule.WRAP, can_be_unknown=False),
+        Point("age", "age of the pose", U16, lambda s: s.t_sent - s.t_mono,
+          "From the time of the pose to the time of sending.", 10_000, "s"),
         Point("t_mono", "time of the pose", U64, attrgetter("t_mono"), "Monotonic clock of the daemon's computer; "
               "never steps.", 1_000_000, "s"),
-        Point("t_utc", "time of sending, UTC", U64, attrgetter("t_utc"), "Since 1970-01-01; may step when the "
-              "computer's clock is set. The pose's own time is `age` earlier.", 1_000_000, "s"),
+        Point("t_utc", "time of sending, UTC", U64, attrgetter("t_utc"),
+          "Since 1970-01-01; steps when the computer's clock is set. The time of the pose is `age` earlier.", 1_000_000,
+          "s"),
         *_pose("map", "pose", "map frame"),
         *_pose("predicted", "predicted", "map frame, predicted to the time of sending"),
         *_pose("odom", "odom", "odom frame (smooth, never jumps)"),
@@ -183,16 +184,17 @@ BODY: Final = Layout(
         Point("v_x", "forward speed", I16, _part("velocity", 0), "In the base frame.", 1000, "m/s"),
         Point("v_y", "sideways speed", I16, _part("velocity", 1), "In the base frame, left positive.", 1000, "m/s"),
         Point("yaw_rate", "turn rate", I16, _part("velocity", 2), "Counter-clockwise.", 1000, "rad/s"),
-        Point("jumps", "jump count", U16, attrgetter("jumps"), "How often the map pose moved against the odom pose by "
-              "more than 5 cm or 1 deg at once.", rule=Rule.WRAP, can_be_unknown=False),
+        Point("jumps", "jump count", U16, attrgetter("jumps"),
+          "Number of changes of the map pose against the odom pose by more than 5 cm or 1 deg at once.", rule=Rule.WRAP,
+          can_be_unknown=False),
         Point("map_id", "map", U32, attrgetter("map_id"), "Identity of the map frame; 0: none yet.", rule=Rule.WRAP,
               can_be_unknown=False),
         Point("loop_new", "loop closure, new end", U32, attrgetter("loop_new"), _KEYFRAME_TEXT),
         Point("loop_old", "loop closure, old end", U32, attrgetter("loop_old"), _KEYFRAME_TEXT),
         Point("loop_counter", "loop closures", U16, attrgetter("loop_counter"), "Accepted since the start.",
               rule=Rule.WRAP, can_be_unknown=False),
-        Point("links", "lights in view", U16, attrgetter("links"), "Not known: no photodiode is configured."),
-        Point("light_id", "strongest light", U16, attrgetter("light_id"), "ID of the strongest light in view."),
+        Point("links", "lamps in view", U16, attrgetter("links"), "Not known: no photodiode is configured."),
+        Point("light_id", "strongest light", U16, attrgetter("light_id"), "Number of the strongest lamp in view."),
         Point("scan_rate", "scan rate", U16, attrgetter("scan_rate"), "Valid scans per second.", 100, "Hz"),
         Point("missed", "scans missed", U32, attrgetter("missed"), "Since the start.", rule=Rule.WRAP,
               can_be_unknown=False),
@@ -265,7 +267,7 @@ def decode_block(block: bytes) -> dict[str, Value]:
     if magic != MODBUS_MAGIC:
         raise ValueError(f"magic is {magic:#06x}, expected {MODBUS_MAGIC:#06x}: not a lumiloop register block")
     if version != VERSION:
-        raise ValueError(f"register map version {version}, this reader knows version {VERSION}")
+        raise ValueError(f"register map version {version}, this reader needs version {VERSION}")
     raw = BODY.big.unpack_from(block, _BLOCK_HEAD.size)
     (seq_end,) = _BLOCK_TAIL.unpack_from(block, len(block) - _BLOCK_TAIL.size)
     if raw[0] != seq_end:
@@ -300,9 +302,9 @@ def decode_datagram(data: bytes) -> dict[str, Value]:
         raise ValueError("not a lumiloop pose datagram")
     _, version, length = _DATAGRAM_HEAD.unpack_from(data)
     if version != VERSION:
-        raise ValueError(f"datagram version {version}, this reader knows version {VERSION}")
+        raise ValueError(f"datagram version {version}, this reader needs version {VERSION}")
     if length != len(data):
-        raise ValueError(f"datagram says {length} bytes and has {len(data)}")
+        raise ValueError(f"the datagram states {length} bytes and has {len(data)}")
     (crc,) = _CRC.unpack_from(data, length - _CRC.size)
     if crc != zlib.crc32(data[: length - _CRC.size]):
         raise ValueError("damaged datagram: CRC-32 differs")

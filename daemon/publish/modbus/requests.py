@@ -144,7 +144,7 @@ class Responder:
         except (ValueError, IndexError, struct.error, ModbusException):
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
         except Exception as error:  # noqa: BLE001  any failure is reported to the client and logged
-            log_once(log, self._defects, error, "a Modbus request cannot be answered; its client is told exception 4")
+            log_once(log, self._defects, error, "a Modbus request has failed; its client receives exception 4")
             return ExceptionResponse(function, ExcCodes.DEVICE_FAILURE)
         return ExceptionResponse(function, ExcCodes.ILLEGAL_FUNCTION)
 
@@ -152,7 +152,7 @@ class Responder:
         holding = function == READ_HOLDING
         request = ReadHoldingRegistersRequest() if holding else ReadInputRegistersRequest()
         if len(body) != _FIXED_BODY:
-            raise ValueError("a read request has five bytes")
+            raise ValueError("a read request must have five bytes")
         request.decode(body[1:])
         data = self._registers(request.address, request.count, holding)
         registers = list(struct.unpack(f">{request.count}H", data))
@@ -177,7 +177,7 @@ class Responder:
 
     def _write_single(self, holding: Holding, body: bytes) -> ModbusPDU:
         if len(body) != _FIXED_BODY:
-            raise ValueError("a write of one register has five bytes")
+            raise ValueError("a write of one register must have five bytes")
         request = WriteSingleRegisterRequest()
         request.decode(body[1:])
         holding.write(request.address, request.registers[0].to_bytes(2, "big"))

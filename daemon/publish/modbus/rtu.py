@@ -54,12 +54,12 @@ async def open_line(device: str, baud: int, *, style: str) -> Port:
     try:
         return await open_serial_port(device, baud, style=style)
     except DeviceMissing as error:
-        remedy = "plug the adapter in, or correct `modbus.serial`; it is opened by itself once it is there"
+        remedy = "connect the adapter, or correct `modbus.serial`; the daemon then opens it automatically"
         raise DeviceMissing(device, error.problem, remedy) from error
     except DeviceRefused as error:
         if error.problem != NOT_SERIAL:
             raise
-        remedy = "name the adapter's own device file in `modbus.serial`, such as /dev/ttyUSB1"
+        remedy = "name the device file of the adapter in `modbus.serial`, such as /dev/ttyUSB1"
         raise DeviceRefused(device, error.problem, remedy) from error
 
 

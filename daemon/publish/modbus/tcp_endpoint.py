@@ -230,7 +230,7 @@ class TcpEndpoint:
         try:
             return connection.serve(most)
         except Exception as error:  # noqa: BLE001  any failure closes this connection alone
-            log_once(log, self._defects, error, "a Modbus client cannot be served; it is disconnected")
+            log_once(log, self._defects, error, "serving a Modbus client has failed; the daemon disconnects it")
             connection.abort()
             return False
 

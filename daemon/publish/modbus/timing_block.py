@@ -17,12 +17,25 @@ from daemon.publish.modbus.points import U16, U32, Point, Rule, Value
 from daemon.snapshot import CycleTiming, Snapshot, Stage
 
 RUNGS: Final = (
-    "everything is done",
+    "all work is done",
     "fewer iterations and points",
-    "no map work either",
-    "the laser is left out too: light and odometry carry the pose",
+    "also no map work",
+    "also no lidar: the pose uses light and odometry",
 )
 """Meaning of the degradation levels, by number. Part of the contract: never renumber."""
+
+STAGES: Final = {
+    Stage.BRIDGE: "results of background jobs, and conversion of device readings",
+    Stage.LIGHTS: "decoding of a block of samples, and the light filter",
+    Stage.SEARCH: "acquisition of lamps that are not tracked yet",
+    Stage.MATCH: "scan match and pose update",
+    Stage.MAP: "keyframes and loop closures",
+    Stage.STEP: "the rest of the estimator step",
+    Stage.JUDGE: "state, protection level and snapshot",
+    Stage.PUBLISH: "registers, datagrams, stream and recording",
+    Stage.OUTSIDE: "time between cycles",
+}
+"""Meaning of the stages of a cycle, by number."""
 
 Getter = Callable[[Snapshot], Value]
 _STAGES: Final = tuple(Stage)[:-1]
@@ -31,8 +44,8 @@ _ROWS: Final[tuple[tuple[str, str, str], ...]] = (
     ("cycle", "whole cycle", "Computing time of a cycle."),
     (
         "late",
-        "lateness of a cycle",
-        "From when it was due (a scan was complete, the idle period over) to its start.",
+        "start delay of a cycle",
+        "From its due time (a complete scan, or the end of the idle period) to its start.",
     ),
     *((stage.name.lower(), f"stage {stage.name}", "") for stage in _STAGES),
 )
@@ -77,19 +90,21 @@ _NAMES: Final = ", ".join(f"{stage.value} {stage.name}" for stage in Stage)
 _RUNGS: Final = ", ".join(f"{number} {text}" for number, text in enumerate(RUNGS))
 
 POINTS: Final = (
-    Point("rung", "what is left out", U16, _count("rung"), f"{_RUNGS}.", can_be_unknown=False),
-    Point("thinned", "cycles on rung 1", U32, _count("thinned"), "Since the start.", rule=Rule.WRAP,
+    Point("rung", "degradation level", U16, _count("rung"), f"{_RUNGS}.", can_be_unknown=False),
+    Point("thinned", "cycles on degradation level 1", U32, _count("thinned"), "Since the start.", rule=Rule.WRAP,
           can_be_unknown=False),
-    Point("without_map", "cycles on rung 2", U32, _count("without_map"), "Since the start.", rule=Rule.WRAP,
+    Point("without_map", "cycles on degradation level 2", U32, _count("without_map"), "Since the start.",
+          rule=Rule.WRAP,
           can_be_unknown=False),
-    Point("carried", "cycles on rung 3", U32, _count("carried"), "Since the start; those during a pause too.",
+    Point("carried", "cycles on degradation level 3", U32, _count("carried"),
+          "Since the start, including those during a pause.",
           rule=Rule.WRAP, can_be_unknown=False),
-    Point("stalls", "stalls", U16, _count("stalls"), "How often no cycle began for two periods more than it should; "
-          "since the start.", rule=Rule.WRAP, can_be_unknown=False),
-    Point("stall", "latest stall", U16, _pulse("stall_s"), "How long the latest one lasted. Not known before the "
-          "first.", 1_000, "s"),
-    Point("stall_in", "latest stall, where", U16, _pulse("stall_in"), f"What ran: {_NAMES}. Not known before the "
-          "first."),
+    Point("stalls", "stalls", U16, _count("stalls"), "Cycles that began more than two periods late, since the start.",
+          rule=Rule.WRAP, can_be_unknown=False),
+    Point("stall", "latest stall", U16, _pulse("stall_s"), "Duration of the latest one. Not known before the first.",
+          1_000, "s"),
+    Point("stall_in", "latest stall, where", U16, _pulse("stall_in"),
+          f"Work at that time: {_NAMES}. Not known before the first."),
     *(point for row in range(len(_ROWS)) for point in _quantiles(row)),
 )  # fmt: skip
 

@@ -49,7 +49,7 @@ class Stream:
 
     def __init__(self, path: Path | str, topics: Sequence[str], patient: bool = True) -> None:
         if unknown := sorted(set(topics) - set(TOPICS)):
-            raise ValueError(f"no such topic: {', '.join(unknown)}; there are {', '.join(TOPICS)}")
+            raise ValueError(f"no such topic: {', '.join(unknown)}; available: {', '.join(TOPICS)}")
         self._of, self.topics, self.patient = path, tuple(topics), patient
 
     @property
@@ -73,7 +73,7 @@ class Stream:
                         async for frame in heard:
                             retry, told = FIRST_RETRY_S, False
                             yield frame
-                    lost = f"{path}: the daemon has closed the stream"
+                    lost = f"{path}: the daemon closed the stream"
             except OSError as error:
                 lost = f"{path}: {_why(error)}"
                 if not told and _nobody(error):
@@ -105,10 +105,10 @@ async def _frames(reader: asyncio.StreamReader) -> AsyncGenerator[Frame, None]:
     while (body := await _body(reader, None if greeted else SILENT_S)) is not None:
         frame = messages.decode(body)
         if not greeted and not isinstance(frame, (messages.Hello, Refused)):
-            raise NotTheStream("who answers does not greet; is this the stream of a lumiloop?")
+            raise NotTheStream("the peer sends no hello message, so it is not a lumiloop daemon")
         greeted = True
         if isinstance(frame, Refused):
-            raise NotTheStream(f"the daemon refuses: {frame.text}")
+            raise NotTheStream(f"the daemon refuses the connection: {frame.text}")
         if frame is not None:
             yield frame
 
@@ -119,12 +119,12 @@ async def _body(reader: asyncio.StreamReader, patience_s: float | None) -> bytes
         async with asyncio.timeout(patience_s):
             length = int.from_bytes(await reader.readexactly(4), "little")
             if length > LONGEST:
-                raise NotTheStream(f"a frame of {length} bytes; is this the stream of a lumiloop?")
+                raise NotTheStream(f"a message has {length} bytes, so this is not a lumiloop stream")
             return await reader.readexactly(length)
     except asyncio.IncompleteReadError:
         return None
     except TimeoutError:
-        raise OSError(f"nothing is said for {SILENT_S:.0f} s: the daemon stands") from None
+        raise OSError(f"no message for {SILENT_S:.0f} s; the daemon does not respond") from None
 
 
 def _nobody(error: OSError) -> bool:
@@ -140,7 +140,7 @@ def _others(path: Path) -> str:
 
 def _why(error: OSError) -> str:
     if _nobody(error):
-        return "nobody listens there; is the daemon running? its log names its stream"
+        return "no daemon listens there; check that it runs, and read the stream's path in its log"
     if isinstance(error, PermissionError):
-        return "you may not open it; who may reach its folder may listen"
+        return "access denied; the user needs access to its folder"
     return error.strerror or str(error)

@@ -257,9 +257,9 @@ class MapTiles(msgspec.Struct, frozen=True, kw_only=True):
         try:
             unpacked = zlib.decompressobj().decompress(packed, size + 1)
         except zlib.error as error:
-            raise NotTheStream(f"a tile of the map cannot be inflated: {error}; is this a lumiloop?") from None
+            raise NotTheStream(f"a map tile cannot be inflated ({error}), so this is not a lumiloop stream") from None
         if len(unpacked) != size:
-            raise NotTheStream(f"a tile of the map has {len(unpacked)} cells, not {size}; is this a lumiloop?")
+            raise NotTheStream(f"a map tile has {len(unpacked)} cells, not {size}, so this is not a lumiloop stream")
         return np.frombuffer(unpacked, np.int8).reshape(self.side, self.side)
 
 
@@ -305,7 +305,7 @@ def decode(body: bytes) -> Frame | None:
         reader = _data.get(envelope.topic)
         return None if reader is None else reader(envelope.data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise NotTheStream(f"a frame cannot be read ({error}); is this the stream of a lumiloop?") from None
+        raise NotTheStream(f"a message cannot be decoded ({error}), so this is not a lumiloop stream") from None
 
 
 def read(topic: str, data: bytes) -> Data:
@@ -326,6 +326,6 @@ def request(topics: tuple[str, ...]) -> bytes:
 
 def _of_this_version(hello: Hello) -> Hello:
     if hello.schema != SCHEMA:
-        told = f"the daemon speaks version {hello.schema} of the stream, this program version {SCHEMA}"
+        told = f"the daemon has version {hello.schema} of the stream, and this program version {SCHEMA}"
         raise NotTheStream(f"{told}; install both from the same release")
     return hello

@@ -26,21 +26,21 @@ SCHEMA: Final = 1
 """Version of all messages. A field never changes its meaning under the same number; readers skip unknown ones."""
 
 LATEST: Final = {
-    "pose": "after each cycle: the whole snapshot, with the state in words",
-    "lights": "after each cycle: what lights alone say, with every link",
-    "scan": "each scan: ranges in m as little-endian float32, not a number where there is none",
+    "pose": "after each cycle: the snapshot, with the meaning of the state",
+    "lights": "after each cycle: the light solution, with every link",
+    "scan": "each scan: ranges in m as little-endian float32, NaN without a return",
     "statistics": "once a second: counters and times of cycle, devices and process",
 }
 """Topics of which a slow client receives the latest message only."""
 ONCE: Final = {
-    "state": "at first and at a change: state and reason, with meaning and remedy",
-    "loop": "a loop closed: counter, both keyframes, residual, reason",
-    "faults": "at first and at a change: all that are present, with meaning, remedy and cause",
+    "state": "at the start and at each change: state and reason, with meaning and remedy",
+    "loop": "each loop closure: counter, both keyframes, residual, reason",
+    "faults": "at the start and at each change: all present faults, with meaning, remedy and cause",
 }
 """Topics of which a client receives every message, up to :data:`KEPT`."""
-RAW: Final = {"raw": "what passes between daemon and devices: bytes of the lidar's port, words of the photodiode"}
+RAW: Final = {"raw": "data between daemon and devices: bytes of the lidar's port, words of the photodiode"}
 """Topics of which a client receives every message, up to :data:`RAW_KEPT`."""
-MAP: Final = {"map": "the map as tiles: at first all, then those that have changed"}
+MAP: Final = {"map": "the map as tiles: first all, then those that have changed"}
 """Topic of which a client receives every tile, with the content at the time of sending."""
 TOPICS: Final[Mapping[str, str]] = {**LATEST, **ONCE, **RAW, **MAP}
 
@@ -140,11 +140,11 @@ class Client(asyncio.Protocol):
         """Why there is no place for this client; empty where there is one."""
         clients = self._server.clients
         if len(clients) >= CLIENTS:
-            return f"{CLIENTS} clients are being served; close one"
+            return f"all {CLIENTS} connections are in use; close one"
         if self.process and sum(one.process == self.process for one in clients) >= max(1, CLIENTS // 2):
-            return f"this program has {CLIENTS // 2} of the {CLIENTS} places; close one"
+            return f"this program uses {CLIENTS // 2} of {CLIENTS} connections; close one"
         if self.process and sum(one.user == self.user for one in clients) >= most_of(CLIENTS):
-            return f"this user's programs have {most_of(CLIENTS)} of the {CLIENTS} places; close one"
+            return f"this user's programs use {most_of(CLIENTS)} of {CLIENTS} connections; close one"
         return ""
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -193,7 +193,7 @@ class Client(asyncio.Protocol):
             return False
         length = int.from_bytes(self._received[:4], "little")
         if length > LONGEST_REQUEST:
-            self._refuse(f"a request of {length} bytes; the longest is {LONGEST_REQUEST}")
+            self._refuse(f"the request has {length} bytes; the limit is {LONGEST_REQUEST}")
             return False
         return len(self._received) >= 4 + length
 
@@ -239,12 +239,12 @@ class Client(asyncio.Protocol):
         try:
             wanted = _request(body).get("want")
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # a key that is no text; too deep
-            self._refuse(f"a request that is no msgpack map: {error}")
+            self._refuse(f"the request is not a msgpack map: {error}")
             return
         if not isinstance(wanted, list) or not all(isinstance(topic, str) for topic in wanted):
-            self._refuse("a request without `want`, a list of topics")
+            self._refuse("the request has no `want`, a list of topics")
         elif unknown := sorted(set(wanted) - set(TOPICS)):
-            self._refuse(f"no such topic: {', '.join(unknown)[:100]}; there are {', '.join(TOPICS)}")
+            self._refuse(f"no such topic: {', '.join(unknown)[:100]}; available: {', '.join(TOPICS)}")
         else:
             before, self.wants = self.wants, frozenset(wanted)
             self._server.welcome(self, self.wants - before)
@@ -257,5 +257,5 @@ class Client(asyncio.Protocol):
             self._transport.close()
 
     def _let_go(self) -> None:
-        log.info("a client of the stream has taken nothing for %.0f s and is let go", STUCK_S)
+        log.info("a client of the stream has read nothing for %.0f s; the daemon disconnects it", STUCK_S)
         self.drop()

@@ -103,7 +103,7 @@ class FakeAdc:
             raise FaultError(fault.what, "this receiver has no DC channel")
         taken = {self.address} | ({self._dc[0]} if self._dc else set())
         if fault.what == "moved" and int(fault.number("address")) in taken:
-            raise FaultError("moved.address", "there is a chip already")
+            raise FaultError("moved.address", "another device has this address already")
 
     def begin(self, fault: Fault) -> None:
         """A fault comes into force (one that happens once happens now)."""

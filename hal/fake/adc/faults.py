@@ -17,7 +17,7 @@ ON = {"on": Parameter("blocks", choices=("blocks", "all"))}
 ADC: Vocabulary = {
     # the general words
     "off": Word("no power: the chip acknowledges nothing, and starts from its reset state", "lasts"),
-    "stuck": Word("the same word again and again", "strikes"),
+    "stuck": Word("the same word repeatedly", "strikes"),
     "garbage": Word("random bytes instead", "strikes"),
     "wrong": Word("words off by `by`, clipped", "strikes", {"by": Parameter(100, -4095, 4095)}),
     "slow": Word("SCL is slower by `factor`", "lasts", {"factor": Parameter(1.6, 1.0, 100.0)}),
@@ -30,7 +30,7 @@ ADC: Vocabulary = {
     "hang": Word("SDA is held low: every transaction times out", "lasts"),
     "arbitration": Word("another master wins the bus in the middle", "strikes", ON),
     # adapter and chip
-    "gone": Word("the adapter is unplugged; what was open stays dead", "lasts"),
+    "gone": Word("the adapter is unplugged; open connections remain dead", "lasts"),
     "refuse": Word("the bus cannot be opened", "lasts", {"why": Parameter("permission", choices=WHY)}),
     "moved": Word("the chip answers at another address", "lasts", {"address": Parameter(0x4E, 0x08, 0x77)}),
     "replaced": Word("another chip answers at the address", "lasts", {"chip": Parameter("ADS1115", choices=CHIPS)}),
@@ -47,7 +47,7 @@ ADC: Vocabulary = {
     ),
     # time
     "stall": Word(
-        "SCL is held low for `us` at `pieces` places, the first at share `at` of the block (-1: anywhere)",
+        "SCL is held low for `us` at `pieces` points, the first at share `at` of the block (-1: anywhere)",
         "strikes",
         {"us": Parameter(100.0, 0.0, 1e6), "at": Parameter(-1.0, -1.0, 1.0), "pieces": Parameter(1, 1, 1000)},
     ),
@@ -55,8 +55,10 @@ ADC: Vocabulary = {
     "late": Word("the return is `by_s` late", "strikes", {"by_s": Parameter(2e-3, 0.0, 10.0)}),
     "scl": Word("SCL is off by `percent`", "lasts", {"percent": Parameter(-1.0, -50.0, 50.0)}),
     # bytes
-    "short": Word("`bytes` fewer than asked for", "strikes", {"bytes": Parameter(100, 1, 8192)}),
-    "released": Word("the chip lets go at share `at` of the block", "strikes", {"at": Parameter(0.5, 0.0, 1.0)}),
+    "short": Word("`bytes` fewer than requested", "strikes", {"bytes": Parameter(100, 1, 8192)}),
+    "released": Word(
+        "the chip releases the bus at share `at` of the block", "strikes", {"at": Parameter(0.5, 0.0, 1.0)}
+    ),
     "floats": Word("every bit reads 1", "strikes"),
     "shift": Word("`bits` clocks too few: everything is shifted", "strikes", {"bits": Parameter(1, 1, 15)}),
     "hit": Word(
@@ -70,8 +72,8 @@ ADC: Vocabulary = {
         "lasts",
         {"gain": Parameter(20.0, 1.0, 1e6), "stop": Parameter(0.004, 0.0, 0.4)},
     ),
-    "dark": Word("no light: only the electronics' own noise", "lasts"),
-    "saturated": Word("so much light that the amplifier stands at its limit", "lasts"),
+    "dark": Word("no light: only electronic noise", "lasts"),
+    "saturated": Word("so much light that the amplifier is saturated", "lasts"),
 }
 """By word. ``off stuck garbage wrong slow delayed intermittent`` are common to all devices."""
 

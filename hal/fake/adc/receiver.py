@@ -70,12 +70,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="LEVEL",
         help="add an ADS1115 at 0x48: 0 is dark, 1 saturated",
     )
-    add("--scl-percent", type=float, default=0.0, help="how far SCL is off its nominal rate")
+    add("--scl-percent", type=float, default=0.0, help="deviation of SCL from its nominal rate")
     add("--faults", type=Path, metavar="FILE", help="TOML schedule of faults, starts at once")
-    add("--control", type=Path, metavar="SOCKET", help="take fault orders on a unix socket while running")
+    add("--control", type=Path, metavar="SOCKET", help="accept fault commands on a unix socket")
     add("--seconds", type=float, default=0.0, help="end after this time (default: run until interrupted)")
     add("--anyone", action="store_true", help="serve TCP beyond this computer")
-    add("--seed", type=int, default=0, help="of noise, jitter and faults left to chance")
+    add("--seed", type=int, default=0, help="seed of noise, jitter and random faults")
     return parser
 
 
@@ -108,11 +108,11 @@ async def _serve(options: _Options) -> None:
     try:
         if options.faults is not None:
             faults = schedule.load(options.faults.read_text(encoding="utf-8"))
-            print_line(f"{len(faults)} faults of {options.faults} ordered")
+            print_line(f"{len(faults)} faults of {options.faults} scheduled")
         print_line(f"{options.chip} at {options.address:#04x} on {await server.listen(options.where)}")
         if options.control is not None:
             control = await serve_control(Control(schedule), options.control)
-            print_line(f"fault orders on {options.control}")
+            print_line(f"fault commands on {options.control}")
         await until_stopped(options.seconds)
     finally:
         schedule.close()

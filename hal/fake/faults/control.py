@@ -81,7 +81,7 @@ class Control:
 
 def _remove_stale_socket(path: Path) -> None:
     if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
-        raise DeviceRefused(str(path), "there is something that is no socket", "choose another path")
+        raise DeviceRefused(str(path), "the path exists and is not a socket", "choose another path")
     path.unlink(missing_ok=True)
 
 

@@ -105,7 +105,7 @@ def _check(path: str, value: Any, rule: Parameter) -> Value:
     if type(value) is not kind:
         raise FaultError(path, f"expected a {kind.__name__}, got {value!r}")
     if rule.choices and value not in rule.choices:
-        raise FaultError(path, f"{value!r} is none of {', '.join(rule.choices)}{_near(value, rule.choices)}")
+        raise FaultError(path, f"{value!r} is not one of {', '.join(rule.choices)}{_near(value, rule.choices)}")
     if isinstance(value, (int, float)) and not rule.low <= value <= rule.high:
         raise FaultError(path, f"{value!r} is outside {rule.low:g}...{rule.high:g}")
     checked: Value = kind(value)
@@ -129,15 +129,15 @@ def _named(table: Mapping[str, Any], path: str, vocabularies: Mapping[str, Vocab
         raise FaultError(f"{path}.where", f"name one of {', '.join(able)}")
     if where is None and not able:
         near = _near(what, {word for words in vocabularies.values() for word in words})
-        raise FaultError(f"{path}.what", f"{what!r} is no fault of any device here{near}")
+        raise FaultError(f"{path}.what", f"{what!r} is not a fault of these devices{near}")
     where = able[0] if where is None else where
     if where not in vocabularies:
         there = sorted(vocabularies)
-        problem = f"{where!r} is no device here; there are: {', '.join(there)}"
+        problem = f"{where!r} is not a device here; available: {', '.join(there)}"
         raise FaultError(f"{path}.where", f"{problem}{_near(where, there)}")
     if what is None or what not in vocabularies[where]:
         known = sorted(vocabularies[where])
-        problem = f"{what!r} is no fault of {where!r}; known: {', '.join(known)}"
+        problem = f"{what!r} is not a fault of {where!r}; available: {', '.join(known)}"
         raise FaultError(f"{path}.what", f"{problem}{_near(what, known)}")
     return where, what
 
@@ -187,7 +187,7 @@ def read_schedule(text: str, vocabularies: Mapping[str, Vocabulary]) -> list[Fau
         raise FaultError("schedule", f"not TOML: {error}") from error
     unknown = sorted(set(tree) - {"fault"})
     if unknown:
-        raise FaultError(unknown[0], "a schedule holds [[fault]] tables and nothing else")
+        raise FaultError(unknown[0], "a schedule must have only [[fault]] tables")
     tables = tree.get("fault", [])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         raise FaultError("fault", "expected [[fault]] tables")

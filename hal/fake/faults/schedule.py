@@ -126,7 +126,7 @@ class FaultSchedule:
     def order(self, fault: Fault) -> None:
         """Schedule one order; ``when`` counts from now."""
         if fault.where not in self._targets:
-            raise FaultError("where", f"{fault.where!r} is no device here; there are: {', '.join(self._targets)}")
+            raise FaultError("where", f"{fault.where!r} is not a device here; available: {', '.join(self._targets)}")
         self._targets[fault.where].check(fault)
         self._timers[fault] = self._loop.call_at(self._loop.time() + fault.when, self._begin, fault)
 

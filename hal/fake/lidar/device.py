@@ -217,7 +217,7 @@ class FakeHokuyo:
             FaultError: ``baud`` at a sensor without a serial line.
         """
         if fault.what == "baud" and self.model.link != "rs232":
-            raise FaultError("baud", f"this {self.model.modl} is wired by {self.model.link}, it has no line rate")
+            raise FaultError("baud", f"this {self.model.modl} is connected by {self.model.link} and has no line rate")
 
     def begin(self, fault: Fault) -> None:
         """A fault comes into force (one that happens once happens now)."""

@@ -15,8 +15,8 @@ PP_KEYS = ("MODL", "DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")
 
 LIDAR: Vocabulary = {
     # the general words
-    "off": Word("no power: the connection drops (a serial line falls silent), then a boot", "lasts"),
-    "stuck": Word("the same scan with the same stamp again and again", "strikes"),
+    "off": Word("no power: the connection drops (a serial line stops), then a restart", "lasts"),
+    "stuck": Word("the same scan with the same stamp repeatedly", "strikes"),
     "garbage": Word("random bytes of the same length instead", "strikes", ON),
     "wrong": Word(
         "valid ranges off by `by_mm`, with correct sums", "strikes", {"by_mm": Parameter(500, -MAX_3, MAX_3)}
@@ -34,7 +34,7 @@ LIDAR: Vocabulary = {
     "drop_byte": Word("one byte is lost", "strikes", ON),
     "drop_line": Word("one data line is lost", "strikes", ON),
     "duplicate_line": Word("one data line comes twice", "strikes", ON),
-    "cut_frame": Word("breaks off in the middle; what follows, follows at once", "strikes", ON),
+    "cut_frame": Word("breaks off in the middle; the next data follow at once", "strikes", ON),
     "alien_reply": Word(
         "another command's reply in the middle of a scan",
         "strikes",
@@ -42,10 +42,10 @@ LIDAR: Vocabulary = {
     ),
     # content of a scan
     "status": Word("a scan's 99 is another status, without data", "strikes", {"code": Parameter(50, 0, 99)}),
-    "frozen_stamp": Word("the stamp stands still while ranges go on", "strikes"),
+    "frozen_stamp": Word("the stamp stops while ranges continue", "strikes"),
     "stamp_jump": Word("stamps are off by `by_ms`", "strikes", {"by_ms": Parameter(-5000, -(1 << 24), 1 << 24)}),
     "wrong_steps": Word(
-        "`by` steps more or fewer than asked for, with correct sums", "strikes", {"by": Parameter(-1, -1000, 1000)}
+        "`by` steps more or fewer than requested, with correct sums", "strikes", {"by": Parameter(-1, -1000, 1000)}
     ),
     "codes": Word(
         "a share of the beams reports `value` (an error code, or 65533: no return)",
@@ -54,7 +54,7 @@ LIDAR: Vocabulary = {
     ),
     "dark": Word("all intensities are 0", "strikes"),
     # the line
-    "silence": Word("the sensor says nothing at all", "lasts"),
+    "silence": Word("the sensor sends nothing at all", "lasts"),
     "stall": Word("nothing arrives, then everything at once", "lasts"),
     "hangup": Word("the connection drops and cannot be opened; the sensor keeps its power", "lasts"),
     "chunks": Word(
@@ -62,17 +62,19 @@ LIDAR: Vocabulary = {
         "lasts",
         {"piece": Parameter(1, 0, 65536), "split_end": Parameter(False), "join": Parameter(1, 1, MAX_JOIN)},
     ),
-    "baud": Word("an RS-232 sensor talks at another rate", "once", {"rate": Parameter(57600, 1200, 750000)}),
+    "baud": Word("an RS-232 sensor sends at another rate", "once", {"rate": Parameter(57600, 1200, 750000)}),
     "inject": Word("another program writes `text` to the sensor", "once", {"text": Parameter("AT\r")}),
     # commands
     "ignore": Word(
-        "`command` is neither obeyed nor answered", "strikes", {"command": Parameter("QT", choices=COMMANDS)}
+        "`command` is neither executed nor answered", "strikes", {"command": Parameter("QT", choices=COMMANDS)}
     ),
     "no_reply": Word(
-        "`command` is obeyed but its acknowledgement is lost", "strikes", {"command": Parameter("MD", choices=COMMANDS)}
+        "`command` is executed, but its acknowledgement is lost",
+        "strikes",
+        {"command": Parameter("MD", choices=COMMANDS)},
     ),
     "denied": Word(
-        "`command` is answered `status`, and not carried out",
+        "`command` is answered `status`, but not executed",
         "strikes",
         {"command": Parameter("VV", choices=COMMANDS), "status": Parameter("0E", choices=REFUSALS)},
     ),
@@ -102,7 +104,7 @@ LIDAR: Vocabulary = {
     # power and state
     "reset": Word("brown-out: starts up again, connection kept", "once"),
     "boot_delay": Word("starting up takes `by_s` longer", "lasts", {"by_s": Parameter(3.0, 0.0, 3600.0)}),
-    "scip1": Word("speaks SCIP 1.1 now and after every start", "lasts"),
+    "scip1": Word("uses SCIP 1.1 now and after every start", "lasts"),
     "set_clock": Word("the clock shows `ms`", "once", {"ms": Parameter((1 << 24) - 1216, 0, (1 << 24) - 1)}),
     "error": Word("stops with status `code` and refuses all but RB", "once", {"code": Parameter(70, 0, 99)}),
     "verify": Word("stops with 21 to check itself, resumes with 98 when lifted", "lasts"),

@@ -44,7 +44,7 @@ class PtyServer:
         self._has_host = False
         self._timer: asyncio.TimerHandle | None = None
         if link is not None and link.exists() and not link.is_symlink():
-            raise DeviceRefused(str(link), "there is something that is no symbolic link", "choose another path")
+            raise DeviceRefused(str(link), "the path exists and is not a symbolic link", "choose another path")
         device.on_reachable(self._reachable)
         self._reachable(device.reachable)
 

@@ -28,7 +28,7 @@ const LEGEND = [
   ]],
   ["Lamps", [
     [lamp(""), "surveyed, not received"], [lamp("ink"), "chosen by a tap"], [lamp("good") + line("good", 'stroke-opacity="0.8"'), "used; a thicker line is a larger RSS"],
-    [line("warn", dashed), "occluded or missing"], [line("bad", dashed), "rejected, twin or not surveyed"], [line("faint", dashed), "not used: paused, rim, faint"],
+    [line("warn", dashed), "occluded or missing"], [line("bad", dashed), "rejected, duplicate code or not surveyed"], [line("faint", dashed), "not used: paused, rim, faint"],
   ]],
 ];
 

@@ -100,7 +100,7 @@ export class Link {
     this.refused = true;
     const again = sessionStorage.getItem(RELOADED) !== page;
     this.told.refused({ what: "version", text: again ? "This page is of another version of lumiloop; loading the right one."
-      : "This page is of another version of lumiloop, and loading it anew has not helped: empty the browser's cache." });
+      : "This page has another version of lumiloop than the server. Clear the browser's cache and load the page again." });
     sessionStorage.setItem(RELOADED, page);
     if (again) setTimeout(() => location.reload(), RELOAD_MS);
     else this.socket.close();

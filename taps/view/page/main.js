@@ -40,7 +40,7 @@ const link = new Link({
     orders.welcome(words);
     tools.scene();
     $("token").close();
-    if (words.wrong_token) toast("That token is not the right one: read-only", "bad");
+    if (words.wrong_token) toast("Wrong token. The page is read-only.", "bad");
   },
   refused(words) {
     if (words.what === "token") $("token").showModal();

@@ -6,7 +6,7 @@ import { $, element, put } from "./panel.js";
 const WIDE_PX = 1000, PAN_PX = 60, LEGEND = "lumiloop-legend";
 const KEYS = [
   ["+ −", "zoom in and out"], ["arrows", "move the map; in a recording 5 s back and forth"], ["0", "show where the robot has been"],
-  ["f", "keep the robot in view"], ["l", "legend"], ["r", "ruler: press and drag"], ["s", "save the map as a picture"],
+  ["f", "keep the robot in view"], ["l", "legend"], ["r", "ruler: press and drag"], ["s", "save the map as an image"],
   ["c", "save the last ten minutes as CSV"], ["t", "light or dark"], ["space", "in a recording: play or pause"],
   ["Esc", "end ruler, pose or lamp details"], ["?", "this list"],
 ];

@@ -181,7 +181,7 @@ def test_a_configuration_is_not_overwritten_unasked(
     assert parser.main([*words, "--force"]) == console.OK
     assert load(out).name == "r7"
     assert "# hall 3\n" in out.read_text(), "comments of the file stay"
-    assert out.read_text().startswith("# Configuration of the drive")
+    assert out.read_text().startswith("# Configuration of drive")
     assert parser.main([*words[:-1], str(tmp_path / "nowhere" / "robot.toml")]) == console.FAILED
     assert "cannot write" in capsys.readouterr().err
 
@@ -191,8 +191,8 @@ def test_what_is_missing_is_said(
 ) -> None:
     out = ["--out", str(tmp_path / "x.toml")]
     for change, words in (
-        ({"survey": replace(played.survey, lamps=())}, "recorded without a survey; name one with --survey"),
-        ({"epochs": []}, "no light of any lamp was decoded"),
+        ({"survey": replace(played.survey, lamps=())}, "the recording has no survey; name one with --survey"),
+        ({"epochs": []}, "no lamp was decoded in the recording"),
         ({"epochs": played.epochs[:10]}, "--start X Y DEGREES"),
     ):
         fields = {name: getattr(played, name) for name in ("path", "poses", "survey", "epochs", "readings")}
@@ -202,7 +202,7 @@ def test_what_is_missing_is_said(
         assert words in capsys.readouterr().err
     monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_: Drive(Path("t"), played.poses, played.survey))
     assert parser.main(["calibrate", "teach", "--odometry"]) == console.FAILED
-    assert "no odometry in it" in capsys.readouterr().err
+    assert "the recording has no odometry" in capsys.readouterr().err
 
 
 def test_a_survey_for_another_air_interface_is_refused(
@@ -215,7 +215,7 @@ def test_a_survey_for_another_air_interface_is_refused(
     assert (
         parser.main(["calibrate", "teach", "--survey", str(path), "--out", str(tmp_path / "x.toml")]) == console.FAILED
     )
-    assert "lamp 7: code 65 is none of profile B, which has codes 0 to 64" in capsys.readouterr().err
+    assert "lamp 7: code 65 is not in profile B, which has codes 0 to 64" in capsys.readouterr().err
 
 
 def test_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -34,15 +34,15 @@ def test_all_good_but_the_bus_is_elsewhere(tmp_path: Path, capsys: pytest.Captur
     assert parser.main(["check", str(file)]) == console.OK
     good, survey, bus, _ = capsys.readouterr().out.splitlines()
     assert good == f"{file}: good"
-    assert survey == f"{tmp_path.resolve() / 'lights.toml'}: good, 2 lamps"
-    assert bus.startswith("as seen from here, /dev/i2c-99: ")
+    assert survey == f"{tmp_path.resolve() / 'lights.toml'}: valid, 2 lamps"
+    assert bus.startswith("from this computer, /dev/i2c-99: ")
 
 
 @pytest.mark.parametrize(
     ("survey", "words"),
     [
         ("lamp = [ { lamp_id = 1, cod = 5, x = 0.0, y = 0.0, z = 2.6 } ]", "did you mean `code`?"),
-        (SURVEY.replace("lamp_id = 2", "lamp_id = 1"), "lights.toml:4: lamp 1: that `lamp_id` is taken already"),
+        (SURVEY.replace("lamp_id = 2", "lamp_id = 1"), "lights.toml:4: lamp 1: another lamp has this `lamp_id`"),
         ("lamp", "not valid TOML"),
     ],
 )
@@ -97,7 +97,7 @@ def test_all_that_is_wrong_is_told_in_one_round(tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.parametrize(
     ("line", "silent"),
-    [("profile = 'C'", "is none of profile"), ("profile = 'A'\n[lights]\nsurvey = 3", "is none of")],
+    [("profile = 'C'", "is not in profile"), ("profile = 'A'\n[lights]\nsurvey = 3", "is none of")],
 )
 def test_what_hangs_on_a_wrong_key_is_not_judged(
     tmp_path: Path, line: str, silent: str, capsys: pytest.CaptureFixture[str]
@@ -124,7 +124,7 @@ def test_the_line_that_names_a_bad_survey_is_told(tmp_path: Path, capsys: pytest
     file = write(tmp_path)
     (tmp_path / "lights.toml").unlink()
     assert parser.main(["check", str(file)]) == console.USAGE
-    assert f"({file}:4 names it: `lights.survey`)" in capsys.readouterr().err
+    assert f"({file}:4 names it with `lights.survey`)" in capsys.readouterr().err
     assert parser.main(["check", str(file), "--set", f"lights.survey={tmp_path}/none.toml"]) == console.USAGE
     assert "none.toml: no such survey" in (said := capsys.readouterr().err)
     assert "(`lights.survey` names it)" in said
@@ -133,15 +133,15 @@ def test_the_line_that_names_a_bad_survey_is_told(tmp_path: Path, capsys: pytest
 def test_a_survey_that_nothing_looks_at_is_remarked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path, bus="")
     assert parser.main(["check", str(file)]) == console.OK
-    assert "the survey is not used: `photodiode.bus` is empty" in capsys.readouterr().out
+    assert "the survey is not used, because `photodiode.bus` is empty" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("mount", "remark"),
     [
-        ("x = 20.0", "`lidar.mount.x` = 20: metres from the robot's centre; is that meant?"),
-        ("yaw = 1.5708", "`lidar.mount.yaw` = 1.5708: degrees; is 90 meant?"),
-        ("yaw = -3.1416", "`lidar.mount.yaw` = -3.1416: degrees; is -180 meant?"),
+        ("x = 20.0", "`lidar.mount.x` = 20: check the unit, metres from the robot's centre"),
+        ("yaw = 1.5708", "`lidar.mount.yaw` = 1.5708: check the unit, degrees; as radians it would be 90 degrees"),
+        ("yaw = -3.1416", "`lidar.mount.yaw` = -3.1416: check the unit, degrees; as radians it would be -180 degrees"),
         ("y = 4.9, yaw = 1.5", ""),
         ("yaw = 90.0", ""),
     ],
@@ -159,7 +159,7 @@ def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixt
     file = tmp_path / "robot.toml"
     file.write_text('map.folder = "/proc/maps"\n')
     assert parser.main(["check", str(file)]) == console.OK
-    assert "/proc/maps: cannot be made by this user" in capsys.readouterr().out
+    assert "/proc/maps: this user cannot create the folder" in capsys.readouterr().out
 
 
 def test_the_folder_of_maps_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -172,12 +172,12 @@ def test_the_folder_of_maps_is_looked_at(tmp_path: Path, capsys: pytest.CaptureF
         return words.out + words.err
 
     alone = ("--set", "map.localise=true")
-    assert f"{maps}: not there yet" in said()
-    assert "`run` would be refused" in said(*alone, code=console.FAILED)
+    assert f"{maps}: the folder does not exist yet" in said()
+    assert "so `run` cannot start" in said(*alone, code=console.FAILED)
     Store(maps).save(whole := content(Shape(submaps=3, map_id=7)), 7)
-    assert f"{maps}: map 00000007 (second floor, Süd) of 3 submaps is good" in said(*alone)
+    assert f"{maps}: map 00000007 (second floor, Süd) of 3 submaps is valid" in said(*alone)
     (maps / "map-00000007-00000002.lumimap").write_bytes(whole[:-1])
-    assert f"{maps}: map 00000007 (second floor, Süd) of 3 submaps is good" in said(), "the generation before it"
+    assert f"{maps}: map 00000007 (second floor, Süd) of 3 submaps is valid" in said(), "the generation before it"
     (maps / "map-00000007-00000001.lumimap").unlink()
     assert f"{maps}: no map in it can be used" in said()
     assert [path.name for path in maps.glob("*.lumimap*")] == ["map-00000007-00000002.lumimap"], "nothing is moved"
@@ -213,10 +213,10 @@ def test_a_folder_that_another_daemon_has_is_said(tmp_path: Path, capsys: pytest
         assert parser.main(["check", str(file), *more]) == console.OK
         return capsys.readouterr().out
 
-    words = f"; process {os.getpid()} keeps its maps there, and no other can (fault 403)"
+    words = f"; process {os.getpid()} stores its maps there, and only one process can (fault 403)"
     assert f"{maps}: no map in it yet{words}" in said()
     other.save(content(Shape(submaps=3, map_id=7)), 7)
-    assert f"of 3 submaps is good{words}" in said()
+    assert f"of 3 submaps is valid{words}" in said()
     assert "fault 403" not in said("--set", "map.localise=true"), "nothing is kept then"
     other.close()
     assert "fault 403" not in said()

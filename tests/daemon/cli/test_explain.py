@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from enum import IntEnum
 from pathlib import Path
 
 import pytest
@@ -13,10 +14,10 @@ from daemon.cli.parser import main, parser
 from daemon.config.loader import options
 from daemon.config.schema import Config
 from daemon.health.faults import FAULTS, Fault
-from daemon.health.reasons import REASONS
+from daemon.health.reasons import REASONS, Reason
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.modbus import holding
-from daemon.snapshot import LightFix, LinkUse, LoopReason, State
+from daemon.snapshot import LightFix, LinkUse, LoopReason, Part, Stage, State, Thread
 from daemon.system.console import FAILED, OK
 
 ROOT = Path(__file__).parents[3]
@@ -86,7 +87,7 @@ def test_a_port_says_who_uses_it(words: list[str], option: str | None, capsys: p
     port = str(default[1] if isinstance(default, tuple) else default).rpartition(":")[2]
     told = _told(capsys, port)
     assert f"port {port}: " in told
-    assert "sets another" in told
+    assert "changes it" in told
     if option is not None:
         assert f"`lumiloop {words[0]}`" in told
 
@@ -123,7 +124,7 @@ def test_what_is_not_known_names_the_nearest(capsys: pytest.CaptureFixture[str])
     assert "cycle.budget_ms" in capsys.readouterr().err
     for strange in ("99999", "nonsense"):
         assert main(["explain", strange]) == FAILED
-        assert "ask for" in capsys.readouterr().err
+        assert "name a key" in capsys.readouterr().err
 
 
 def test_a_kind_alone_wants_its_number(capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,6 +147,15 @@ def test_every_published_number_has_its_words() -> None:
     assert set(USES) == set(LinkUse)
     assert set(LOOPS) == set(LoopReason)
     assert set(COMMANDS) == set(holding.CommandCode)
+
+
+@pytest.mark.parametrize("table", [State, Reason, Fault, LightFix, LinkUse, LoopReason, Part, Thread, Stage])
+def test_every_name_that_status_shows_is_explained(table: type[IntEnum]) -> None:
+    everything = list(entries())
+    kind = {"LightFix": "light fix", "LinkUse": "link use", "LoopReason": "loop reason", "Part": "component"}
+    wanted = kind.get(table.__name__, table.__name__.lower())
+    shown = [member for member in table if member.value or table is not Fault]
+    assert [one.name for one in shown if not find(f"{wanted} {one.name}", everything)] == []
 
 
 def test_every_entry_can_be_asked_for() -> None:

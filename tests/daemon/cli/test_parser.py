@@ -27,7 +27,7 @@ def test_check_good_and_bad(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert parser.main(["check", str(file)]) == console.OK
     good, maps = capsys.readouterr().out.splitlines()
     assert good == f"{file}: good"
-    assert maps == f"{maps_folder('')}: not there yet, maps will be kept in it"
+    assert maps == f"{maps_folder('')}: the folder does not exist yet; the daemon creates it for its maps"
     file.write_text("[modbus]\nport = 'x'\n")
     assert parser.main(["check", str(file)]) == console.USAGE
     assert capsys.readouterr().err.startswith(f'lumiloop: {file}:2: `modbus.port` = "')
@@ -147,11 +147,11 @@ def test_an_interrupt_that_is_ignored_stays_ignored() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"), [("ten", "'ten' is no number of minutes"), ("0", "0 minutes"), ("1441", "1441")]
+    ("text", "says"), [("ten", "'ten' is not a number of minutes"), ("0", "0 minutes"), ("1441", "1441")]
 )
 def test_a_ring_that_is_none_is_said_with_what_may_be(text: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         parser.main(["run", "--record", "x", "--last", text])
     said = capsys.readouterr().err
     assert f"{says}" in said
-    assert "name 1 to 1440" in said
+    assert "give 1 to 1440" in said

@@ -21,7 +21,7 @@ from hal.port.port import PortOpener
 from tests.daemon.support.room import URG
 
 LIDAR = Finding("/dev/ttyACM0", URG, "SOKUIKI Sensor URG-04LX", "SCIP 2.0", "Sensor works well.")
-NOTHING = Finding("/dev/ttyACM1", error=DeviceMissing("/dev/ttyACM1", "no such device", "plug it in"))
+NOTHING = Finding("/dev/ttyACM1", error=DeviceMissing("/dev/ttyACM1", "no such device", "connect it"))
 BUSY = Finding("/dev/ttyS0", error=DeviceRefused("/dev/ttyS0", "busy", "stop the other program"))
 
 
@@ -29,7 +29,7 @@ BUS = BusFinding(
     "/dev/i2c-1", "bcm2835 (i2c@7e804000)", (Chip(0x48, "ADS1015 or ADS1115"), Chip(0x4D, "MCP3221", True))
 )
 EMPTY = BusFinding("unix:/run/i2c", "remote")
-CLOSED = BusFinding("/dev/i2c-3", error=DeviceRefused("/dev/i2c-3", "permission denied", "join the group i2c"))
+CLOSED = BusFinding("/dev/i2c-3", error=DeviceRefused("/dev/i2c-3", "permission denied", "add the user to group i2c"))
 
 
 def run(
@@ -83,7 +83,7 @@ def test_programs_get_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert (lidar["model"], lidar["serial"], lidar["beams"]) == ("URG-04LX", "H0500000", 682)
     assert (lidar["from_deg"], lidar["to_deg"]) == (-119.531, 119.883)
     assert lidar["range_m"] == [0.02, 5.6]
-    assert nothing == {"device": "/dev/ttyACM1", "problem": "no such device", "remedy": "plug it in"}
+    assert nothing == {"device": "/dev/ttyACM1", "problem": "no such device", "remedy": "connect it"}
 
 
 def test_the_exit_code_says_whether_what_was_named_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,7 +111,7 @@ def test_converters_are_listed_with_the_keys_that_use_them(
     assert "/dev/i2c-1: bcm2835 (i2c@7e804000)\n  0x48: ADS1015 or ADS1115 (levels only" in output
     assert 'use it: photodiode.bus = "/dev/i2c-1", photodiode.converter = "mcp3221@0x4d"\n' in output
     assert 'use it: photodiode.level = "ads1115@0x48/0"\n' in output
-    assert "/dev/i2c-3: permission denied (join the group i2c)" in output
+    assert "/dev/i2c-3: permission denied (add the user to group i2c)" in output
     keys = {"bus": "/dev/i2c-1", "converter": "mcp3221@0x4d", "level": "ads1115@0x48/0"}
     assert msgspec.convert(keys, PhotodiodeConfig).fitted, "what is said can be used"
 

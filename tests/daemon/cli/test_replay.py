@@ -234,7 +234,7 @@ def test_a_log_that_is_mostly_guessed_says_so_in_its_last_line(
 
     monkeypatch.setattr(Trajectory, "guesses", lost)
     assert parser.main(["replay", str(log), "--out", str(tmp_path)]) == console.OK
-    assert "30 % of the poses are guesses: do not rely on" in capsys.readouterr().err.splitlines()[-1]
+    assert "30 % of the poses are unconfirmed; do not use" in capsys.readouterr().err.splitlines()[-1]
     counts = summary_of(tmp_path)["counts"]
     assert counts["guesses"] == pytest.approx(0.3 * float(str(counts["poses"])), abs=1.0)
 
@@ -243,7 +243,7 @@ def test_a_log_that_is_mostly_guessed_says_so_in_its_last_line(
     ("trouble", "code", "says"),
     [
         (KeyboardInterrupt(), console.INTERRUPTED, "interrupted"),
-        (DeviceFault("room.log", "the disk has gone", "plug it in"), console.FAILED, "the disk has gone"),
+        (DeviceFault("room.log", "the disk has gone", "connect it"), console.FAILED, "the disk has gone"),
     ],
 )
 def test_what_ends_a_replay_early_leaves_what_was_computed(
@@ -269,7 +269,7 @@ def test_what_ends_a_replay_early_leaves_what_was_computed(
     assert parser.main(["replay", str(log), "--out", str(tmp_path)]) == code
     said = capsys.readouterr().err
     assert says in said
-    assert "what was computed until then is in" in said
+    assert "the results up to there are in" in said
     assert len(read_tum(tmp_path / "trajectory.tum")[0]) == 20
     assert summary_of(tmp_path)["complete"] is False
 
@@ -278,7 +278,7 @@ def test_a_capture_without_scans_is_no_success(tmp_path: Path, capsys: pytest.Ca
     path = tmp_path / "a.logr"
     path.write_bytes(bytes(7) + b"\x05" + (6).to_bytes(4, "big") + b"VV\n00P")
     assert parser.main(["replay", str(path), "--out", str(tmp_path / "out")]) == console.FAILED
-    assert "without a scan that gave a pose" in capsys.readouterr().err
+    assert "does not contain a scan that gave a pose" in capsys.readouterr().err
 
 
 def test_the_real_capture_gives_its_poses(log_root: Path, tmp_path: Path) -> None:

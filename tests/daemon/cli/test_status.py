@@ -19,12 +19,13 @@ import pytest
 
 from daemon.cli import status as cli_status
 from daemon.cli import status_table
+from daemon.cli.explain import entries, find
 from daemon.cli.reports.status import as_object
 from daemon.config.schema import Config, ModbusConfig
 from daemon.publish.modbus import client, lights_block, registers
 from daemon.publish.modbus.parts_block import PARTS
 from daemon.publish.modbus.requests import BLOCKS
-from daemon.snapshot import Snapshot, State
+from daemon.snapshot import Condition, Part, Snapshot, State, Thread, Trust
 from tests.daemon.publish.modbus.test_lights_block import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import publishing
@@ -67,7 +68,30 @@ def test_a_person_reads_the_table(capsys: pytest.CaptureFixture[str]) -> None:
         "2023-11-14 22:13:20 UTC\n",
     ):
         assert line in shown
-    assert "STANDS STILL" not in shown
+    assert "STALLED" not in shown
+
+
+def test_every_label_of_the_table_is_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    down = Condition(
+        faults=(301, 304),
+        restarts=(1,) * len(Part),
+        down=frozenset({Part.MODBUS}),
+        hanging=frozenset({Thread.MAP}),
+        uptime_s=9.0,
+    )
+    looking = Trust(horizontal_m=0.2, yaw_rad=0.01, laser=True, limit_m=0.1, places=2)
+    taken = snapshot(light=picture(), links=3, fault=301, condition=down, trust=looking, state=State.RELOCATING)
+    assert run_against(taken, advance=False) == 0
+    lines = capsys.readouterr().out.splitlines()
+    labels = {line[:10].strip() for line in lines} - {""}
+    columns = set(next(line for line in lines if line.startswith("links"))[10:].split())
+    assert {"hypotheses", "protection", "running", "RSS", "use"} < labels | columns
+    everything = list(entries())
+    assert [
+        word
+        for word in sorted(labels | columns | {"STALLED", "ALERT", "hanging", "down"})
+        if not find(word, everything)
+    ] == []
 
 
 def test_a_person_sees_the_links_beside_the_pose(capsys: pytest.CaptureFixture[str]) -> None:
@@ -78,7 +102,7 @@ def test_a_person_sees_the_links_beside_the_pose(capsys: pytest.CaptureFixture[s
         "light fix  GOOD, 5 used, age 0.0500 s\n",
         "light pose x -1.2345 m, y 7.2500 m, yaw -159.46 deg\n",
         "           sigma 0.0211 m, 0.0300 m, 0.57 deg\n",
-        "links        lamp  code     strength  residual  use\n",
+        "links        lamp  code          RSS  residual  use\n",
         "             1017    17   1250.00 nA    -3.1 %  ACCEPTED\n",
         "                -    60    500.00 nA         -  TWIN\n",
         "            65000   101      3.10 nA   -96.2 %  OCCLUDED\n",
@@ -90,7 +114,7 @@ def test_a_person_sees_the_links_beside_the_pose(capsys: pytest.CaptureFixture[s
 def test_a_pose_whose_place_is_not_known_is_marked_as_a_guess(state: State, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_against(snapshot(state=state, map_id=0xC0FFEE), advance=False) == 0
     shown = capsys.readouterr().out
-    assert "yaw 171.89 deg  (a guess: the place is not known)\n" in shown
+    assert "yaw 171.89 deg  (unconfirmed pose)\n" in shown
     assert "map        id 00c0ffee, " in shown
 
 
@@ -106,7 +130,7 @@ def test_a_daemon_of_a_version_without_the_block_of_lights_is_read_too(
 
 def test_a_daemon_whose_cycle_stands_still_is_shown_as_such(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_against(snapshot(reason=0, fault=0), advance=False) == 0
-    assert "STANDS STILL" in capsys.readouterr().out
+    assert "STALLED" in capsys.readouterr().out
 
 
 def test_before_the_first_cycle_no_device_is_judged_and_nothing_is_said_to_stand_still(
@@ -114,8 +138,8 @@ def test_before_the_first_cycle_no_device_is_judged_and_nothing_is_said_to_stand
 ) -> None:
     assert run_against(snapshot(state=State.STARTING), advance=False) == 0
     shown = capsys.readouterr().out
-    assert "devices    lidar, odometry: told from the first cycle on\n" in shown
-    assert "STANDS STILL" not in shown
+    assert "devices    lidar, odometry: no data before the first cycle\n" in shown
+    assert "STALLED" not in shown
     assert "NOT OK" not in shown
 
 
@@ -132,16 +156,16 @@ def test_what_is_not_known_reads_so(capsys: pytest.CaptureFixture[str]) -> None:
 def test_reasons_and_faults_come_with_a_remedy(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_against(snapshot(reason=4, fault=101), advance=False) == 0
     shown = capsys.readouterr().out
-    silent = "no valid scan for three scan periods, or scans do not arrive steadily yet"
+    silent = "no valid scan for three scan periods, or scans are not steady yet"
     assert f"reason     4: {silent} (check the lidar's power and cable)\n" in shown
-    assert "fault      101: the lidar is not there (" in shown
+    assert "fault      101: no lidar is found (" in shown
 
 
 def test_numbers_of_a_newer_daemon_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_against(snapshot(reason=60_000, fault=60_001), advance=False) == 0
     shown = capsys.readouterr().out
-    assert "reason     60000: unknown to this reader" in shown
-    assert "fault      60001: unknown to this reader" in shown
+    assert "reason     60000: unknown to this version" in shown
+    assert "fault      60001: unknown to this version" in shown
 
 
 def test_a_program_reads_json(capsys: pytest.CaptureFixture[str]) -> None:
@@ -248,8 +272,8 @@ def test_a_lost_datagram_is_asked_for_again(
     ("block", "head", "words"),
     [
         (bytes(128), b"\x00\x00\x00\x83\x01\x04\x80", "not a lumiloop register block"),
-        (b"", b"\x00\x00\x00\x03\x01\x84\x02", "exception 2; that is another kind of device"),
-        (b"\x4c\x4c\x00\x09" + bytes(124), b"\x00\x00\x00\x83\x01\x04\x80", "version 9, this reader knows version 1"),
+        (b"", b"\x00\x00\x00\x03\x01\x84\x02", "exception 2; this is another kind of device"),
+        (b"\x4c\x4c\x00\x09" + bytes(124), b"\x00\x00\x00\x83\x01\x04\x80", "version 9, this reader needs version 1"),
         (bytes(20), b"\x00\x00\x00\x17\x01\x04\x14", "64 registers, got 10"),
         (b"", b"", "64 registers, got 0"),
     ],
@@ -299,8 +323,8 @@ def test_whose_registers_are_shown_is_said(
             assert status(None, settings) == 1
             said = capsys.readouterr()
             assert not said.out
-            assert f"{address} is answered by process {os.getpid()}" in said.err
-            assert f"not by `agv` (process {meant})" in said.err
+            assert f"{address} belongs to process {os.getpid()}" in said.err
+            assert f"not to `agv` (process {meant})" in said.err
             assert "modbus.port" in said.err
             assert status(address, settings) == 0, "who names an address means whoever answers there"
             assert capsys.readouterr().out.startswith("state")
@@ -371,4 +395,4 @@ def test_an_age_or_a_sigma_at_the_end_of_its_register_may_be_any_larger() -> Non
 
 def test_a_state_of_a_newer_daemon_is_shown_by_number() -> None:
     reading: Any = registers.decode_block(registers.encode_block(snapshot(reason=0, fault=0))) | {"state": 99}
-    assert "unknown to this reader (99)" in status_table.as_table(reading, stalled=False)
+    assert "unknown to this version (99)" in status_table.as_table(reading, stalled=False)

@@ -53,7 +53,7 @@ def test_watching_shows_when_the_daemon_is_away(
     monkeypatch.setattr("daemon.cli.status.time.sleep", nap)
     with pytest.raises(KeyboardInterrupt):
         status(f"127.0.0.1:{port}", watch=True)
-    assert capsys.readouterr().err.count("nothing serves Modbus there") == 1  # of three looks
+    assert capsys.readouterr().err.count("no Modbus server runs there") == 1  # of three looks
 
 
 def test_watching_says_anew_what_is_new(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,7 +120,18 @@ def test_on_80_by_24_everything_that_matters_is_on_the_first_page(capsys: pytest
     whole = terminal_screen.wrapped(capsys.readouterr().out, 80, 11)
     first = whole[:23]
     labels = [line[:11].strip() for line in first if line[0] != " "]
-    wanted = ["state", "reason", "map pose", "sigma", "bound", "fault", "lights", "light fix", "light pose", "links"]
+    wanted = [
+        "state",
+        "reason",
+        "map pose",
+        "sigma",
+        "protection",
+        "fault",
+        "lights",
+        "light fix",
+        "light pose",
+        "links",
+    ]
     assert labels[: len(wanted)] == wanted
     assert "check the lidar's power and cable" in " ".join(" ".join(first).split())
     assert [line for line in whole if " nA" in line] == [line for line in first if " nA" in line] != []

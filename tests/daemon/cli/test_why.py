@@ -37,7 +37,7 @@ def test_what_the_service_records_is_looked_for_where_we_have_recorded_nothing(
     monkeypatch.setattr(paths, "SERVICE_STATE", tmp_path / "service")
     assert parser.main(["why", "3"]) == 1
     said = capsys.readouterr().err
-    assert f"nothing is recorded in {tmp_path}/ours/flight, nor in " in said
+    assert f"no recording was found in {tmp_path}/ours/flight or " in said
     assert f"--record {tmp_path}/ours/flight --last 10" in said
     (tmp_path / "service" / "flight").mkdir(parents=True)
     assert parser.main(["why", "3"]) == 1
@@ -64,7 +64,7 @@ def test_a_recording_that_is_not_open_to_this_user_is_said_to_be_so(
 
     monkeypatch.setattr(Path, "stat", closed)
     assert parser.main(["why", "3", *([str(service / "flight")] if named else [])]) == 1
-    assert f"{service}/flight: may not be read by this user (run it with sudo" in capsys.readouterr().err
+    assert f"{service}/flight: cannot be read by this user (run this with sudo" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("wheels_m", "turn", "agree"), [(1.0, 0.0, True), (0.65, 0.0, False), (1.0, 0.4, False)])
@@ -93,7 +93,7 @@ def test_a_lidar_that_is_gone(recorded: Path, capsys: pytest.CaptureFixture[str]
     (dump,) = recorded.glob(f"{DUMP}*-fault-101")
     said = asked("9", dump, capsys)
     assert "NO_LIDAR since" in said
-    assert "laser   silent for 5.1 s; before: " in said
+    assert "lidar    no data for 5.1 s; before: " in said
     assert "x       UNKNOWN since" in said
     assert "TRACKING: the pose is confirmed" in said
     assert "NO_LIDAR: reason 3, the lidar cannot be opened" in said
@@ -107,13 +107,13 @@ def test_what_was_published_is_shown_with_its_faults_at_their_own_times(
     (dump,) = recorded.glob(f"{DUMP}*-fault-101")
     head, state, fault, *rest = asked("2023-11-14T22:13:25Z", dump, capsys).splitlines()
     at = fault.split(" since ")[1].split(": ")[0]
-    assert f"the whole second: state, reason or faults first change in it, cycle of {at}" in head
+    assert f"the whole second: first change of state, reason or faults in it, cycle of {at}" in head
     assert "NO_LIDAR since" in state
     assert ": reason 3, the lidar cannot be opened (" in state
     assert at not in state, "it came later"
     assert fault.startswith("fault 101 since ")
-    assert "the lidar is not there (check power" in fault
-    assert f"  {at}  fault 101 comes: the lidar is not there" in rest
+    assert "no lidar is found (check power" in fault
+    assert f"  {at}  fault 101 comes: no lidar is found" in rest
 
 
 def test_a_fault_that_is_over_is_told_too(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,9 +121,9 @@ def test_a_fault_that_is_over_is_told_too(recorded: Path, capsys: pytest.Capture
     changes = asked("2023-11-14T22:13:38Z", ring, capsys).splitlines()
     (over,) = (line.split()[0] for line in changes if "fault 101 is over" in line)  # the attempts to open decide when
     said = asked(f"2023-11-14T22:13:{over[6:8]}Z", ring, capsys)
-    assert "state, reason or faults first change in it" in said.splitlines()[0]
+    assert "first change of state, reason or faults in it" in said.splitlines()[0]
     assert "fault 101 since" not in said
-    assert "fault 101 is over: the lidar is not there" in said
+    assert "fault 101 is over: no lidar is found" in said
 
 
 def test_of_an_older_recording_it_is_said_what_is_not_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -132,7 +132,7 @@ def test_of_an_older_recording_it_is_said_what_is_not_known(tmp_path: Path, caps
     said = asked("6.5", tmp_path / "rec", capsys)
     assert "NO_LIDAR since" in said
     assert "reason 4, no valid scan" in said
-    assert "(published reason and faults were not recorded then: the reason is the replay's" in said
+    assert "(the recording has no published reason and faults; the reason is the replay's" in said
     assert "\nfault " not in said
 
 
@@ -144,7 +144,9 @@ def test_a_recording_of_another_build_is_said_to_be_one(
     built = build()
     monkeypatch.setattr("daemon.system.versions.build", lambda: "of today")
     made = next(line for line in asked("9", dump, capsys).splitlines() if line.startswith("recorded with"))
-    assert made == f"recorded with build {built}; this is build of today: the replay may differ from what ran then"
+    assert (
+        made == f"recorded with build {built}; this is build of today, so the replay may differ from the recorded run"
+    )
 
 
 def test_a_whole_second_is_of_the_first_change_in_it(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -155,9 +157,9 @@ def test_a_whole_second_is_of_the_first_change_in_it(recorded: Path, capsys: pyt
     second, fraction = at.split(".")
     assert int(fraction) > 0, "else nothing is shown here"
     said = asked(second, dump, capsys)
-    assert "laser   silent for 0." in said, "as published, however short it is"
+    assert "lidar    no data for 0." in said, "as published, however short it is"
     head, state = said.splitlines()[:2]
-    assert f"{second}{ZONE}, the whole second: state, reason or faults first change in it, cycle of {at}" in head
+    assert f"{second}{ZONE}, the whole second: first change of state, reason or faults in it, cycle of {at}" in head
     assert state == silent
     head, state = asked(f"{second}.0", dump, capsys).splitlines()[:2]
     assert f"{second}.000{ZONE}, cycle of" in head
@@ -177,8 +179,8 @@ def test_a_time_that_it_has_printed_means_the_same_cycle(recorded: Path, capsys:
 def test_a_run_where_all_is_well_from_a_folder_of_several(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = asked("2023-11-14T22:13:23Z", recorded, capsys)
     assert "TRACKING since" in said
-    assert "laser   speaks" in said
-    assert "wheels  agree with the laser" in said
+    assert "lidar    matches" in said
+    assert "odometry agrees with the lidar" in said
     assert "heading known since" in said
 
 
@@ -205,7 +207,7 @@ def test_a_picture_that_cannot_be_had_is_refused_before_anything_is_replayed(
     with pytest.raises(SystemExit) as ended:
         parser.main(["why", "9", str(recorded), "--out", "why.xyz"])
     assert ended.value.code == console.USAGE
-    assert "why.xyz: a picture ends with .png, .svg, .pdf" in capsys.readouterr().err
+    assert "why.xyz: unknown image format; use a name that ends with .png, .svg, .pdf" in capsys.readouterr().err
     (tmp_path / "file").touch()
     (tmp_path / "folder.png").mkdir()
     for name, problem in (
@@ -233,7 +235,7 @@ def test_a_picture_that_cannot_be_had_is_refused_before_anything_is_replayed(
     assert not list((tmp_path / "closed").iterdir())
     monkeypatch.setattr("daemon.cli.why.find_spec", lambda name: None)
     assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / "why.png")]) == console.FAILED
-    assert "pictures need matplotlib" in capsys.readouterr().err
+    assert "plots need matplotlib" in capsys.readouterr().err
 
 
 def test_for_a_time_that_is_none_no_folder_is_made(
@@ -285,8 +287,8 @@ def test_a_recording_whose_head_says_no_time_is_named_and_passed_over(
     assert "lumiloop replay" in said
     assert parser.main(["why", "3600", str(tmp_path)]) == 1
     said = capsys.readouterr().err
-    assert "passed over" in said
-    assert "there is" in said
+    assert "ignored" in said
+    assert "available" in said
 
 
 async def slipping(bench: Bench) -> None:
@@ -307,9 +309,9 @@ async def slipping(bench: Bench) -> None:
 def test_wheels_that_slip_dissent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record(tmp_path / "rec", slipping)
     said = asked("7.5", tmp_path / "rec", capsys)
-    assert "wheels  DISSENT: in" in said
-    assert "the wheels begin to dissent" in said
-    assert "odometry and laser disagree" in said
+    assert "odometry DISAGREES: in" in said
+    assert "odometry begins to disagree" in said
+    assert "odometry and lidar disagree about the motion" in said
 
 
 @pytest.mark.parametrize("named", ["nowhere", "nowhere/at/all"])

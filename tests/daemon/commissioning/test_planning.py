@@ -153,12 +153,12 @@ def test_a_plan_that_falls_short_says_why(
     assert plan.short_of(Goals()) == ""
     few = Goals(most=3)
     short = choose(large, FITTING, wall_information(large), few).short_of(few)
-    assert re.fullmatch(r"goal NOT reached: limit of 3 lamps; \d+\.\d % of the places where it could be", short)
+    assert re.fullmatch(r"goal NOT reached \(limit of 3 lamps\); \d+\.\d % of the positions that can reach it", short)
     path = write_pgm(tmp_path, room(3.0, 3.0))
     words = ["plan", str(path), "--out", str(tmp_path / "plan"), "--lamps", "400", "--spacing", "1.0"]
     assert parser.main(words) == console.FAILED
     said = capsys.readouterr()
-    assert re.search(r"only \d+ spots", said.err)
+    assert re.search(r"only \d+ positions", said.err)
     assert "lamps: " in said.out, "what was found is told and written"
     assert (tmp_path / "plan" / "lights.toml").exists()
 
@@ -205,13 +205,13 @@ def test_the_command_writes_a_survey_that_it_can_judge_again(
     survey = read_survey(tmp_path / "plan" / "lights.toml")
     assert len({lamp.code for lamp in survey.lamps}) == 9
     assert {lamp.z for lamp in survey.lamps} == {3.0}
-    assert all(1.0 < lamp.x < 7.6 and -2.0 < lamp.y < 3.6 for lamp in survey.lamps), "in the map's frame"
+    assert all(1.0 < lamp.x < 7.6 and -2.0 < lamp.y < 3.6 for lamp in survey.lamps), "in the map frame"
     assert (tmp_path / "plan" / "plan.png").read_bytes().startswith(b"\x89PNG")
     judged = ["plan", str(path), "--out", str(tmp_path / "b"), "--survey", str(tmp_path / "plan" / "lights.toml")]
     assert parser.main(judged) == console.OK
     again = capsys.readouterr().out
-    assert [line for line in said.splitlines() if line.startswith("laser and light")] == [
-        line for line in again.splitlines() if line.startswith("laser and light")
+    assert [line for line in said.splitlines() if line.startswith("lidar and light")] == [
+        line for line in again.splitlines() if line.startswith("lidar and light")
     ]
     assert not (tmp_path / "b" / "lights.toml").exists()
     assert parser.main([*judged, "--json"]) == console.OK
@@ -220,7 +220,7 @@ def test_the_command_writes_a_survey_that_it_can_judge_again(
     places = {(lamp.x, lamp.y) for lamp in survey.lamps}
     assert {(at["x_m"], at["y_m"]) for at in told["lamps"]["positions"]} == places
     median = 100.0 * told["accuracy"]["laser_and_light"]["median_m"]
-    assert f"laser and light: median {median:.1f} cm" in again
+    assert f"lidar and light: median {median:.1f} cm" in again
 
 
 @pytest.mark.parametrize(("width", "depth"), [(40.0, 2.2), (2.2, 30.0)])
@@ -273,16 +273,16 @@ def test_a_plan_that_lies_turned_in_the_map() -> None:
     ("words", "text"),
     [
         (["--height", "0.4"], "not above the receiver"),
-        (["--height", "99"], "name metres above the floor, more than 0.2, 30 at most"),
-        (["--lamps", "0"], "name one or more"),
-        (["--lamps", "3", "--survey", "none.toml"], "name one of them"),
-        (["--accuracy", "0"], "have to be above 0"),
-        (["--reach", "nan"], "have to be above 0"),
-        (["--spacing", "inf"], "have to be above 0"),
+        (["--height", "99"], "give metres above the ground, more than 0.2, 30 at most"),
+        (["--lamps", "0"], "give a number of 1 or more"),
+        (["--lamps", "3", "--survey", "none.toml"], "use only one of them"),
+        (["--accuracy", "0"], "must be above 0"),
+        (["--reach", "nan"], "must be above 0"),
+        (["--spacing", "inf"], "must be above 0"),
         (["--survey", "none.toml"], "none.toml"),
-        (["--width", "0"], "--width 0: name metres above 0"),
+        (["--width", "0"], "--width 0: out of range; give metres above 0"),
         (["--start", "nan", "0"], "two finite numbers"),
-        (["--start", "-90", "0"], "the robot does not fit there; the nearest place is"),
+        (["--start", "-90", "0"], "the robot does not fit there; the nearest possible position is"),
     ],
 )
 def test_what_cannot_be_planned_is_said(
@@ -297,12 +297,12 @@ def test_plans_that_are_none(tmp_path: Path) -> None:
     for name in ("none.yaml", "none.pgm"):
         with pytest.raises(NoHall, match=rf"{name}: no such file"):
             read_hall(tmp_path / name, 0.5)
-    with pytest.raises(NoHall, match="is a folder; name the picture in it"):
+    with pytest.raises(NoHall, match="this is a folder; name the image in it"):
         read_hall(tmp_path, 0.5)
     (tmp_path / "alone.pgm").touch()
-    with pytest.raises(NoHall, match="not beside it"):
+    with pytest.raises(NoHall, match="with the size of a pixel is missing"):
         read_hall(tmp_path / "alone.pgm", 0.5)
-    with pytest.raises(NoHall, match="no place in the plan"):
+    with pytest.raises(NoHall, match="the plan has no free position for a robot"):
         hall_of(np.ones((50, 50), np.int8), 0.05, (0.0, 0.0, 0.0), 0.5)
     (tmp_path / "bad.lumimap").write_bytes(b"no map")
     with pytest.raises(NoHall):
@@ -318,7 +318,7 @@ def test_a_lamp_in_a_corner_tells_only_those_within_reach() -> None:
     text = report(
         small, plan_of(small, FITTING, wall_information(small), Goals(), np.array(((0.5, 0.5),))), Goals(), FITTING
     )
-    assert "light alone: median over 1 m, over 1 m at 100.0 % of places" in text
+    assert "light solution: median over 1 m, over 1 m at 100.0 % of positions" in text
     some = np.array((0.05, 0.06, math.inf, 0.07, 0.08, 0.09, 0.04, 0.05, 0.06, math.inf))
-    assert deviations(some) == "median 7.0 cm, over 1 m at 20.0 % of places"
+    assert deviations(some) == "median 7.0 cm, over 1 m at 20.0 % of positions"
     assert deviations(some[:2]) == "median 6.0 cm, 95 % within 6.0 cm"

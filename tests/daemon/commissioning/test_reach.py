@@ -53,7 +53,7 @@ def test_a_robot_reaches_what_it_fits_through() -> None:
     assert "left out" not in said(wide)
     assert narrow.places[:, 0].max() < 6.4
     assert narrow.spots[:, 0].max() < 7.0, "no lamp where it does not drive"
-    assert f"left out: 8 m2 that a robot 1.20 m wide cannot reach from ({start[0]:g}, {start[1]:g})" in said(narrow)
+    assert f"excluded: 8 m2 that a robot 1.20 m wide cannot reach from ({start[0]:g}, {start[1]:g})" in said(narrow)
     other = halls(1.0, Robot(1.2, in_map(8.0, 2.0)))
     assert other.places[:, 0].min() > 6.4
 
@@ -61,8 +61,10 @@ def test_a_robot_reaches_what_it_fits_through() -> None:
 def test_areas_that_are_not_connected_are_named() -> None:
     apart = halls(0.4, Robot())
     assert apart.places[:, 0].max() > 9.5, "no start is known: all of it"
-    assert "2 areas are not connected: name --start X Y" in said(apart)
-    with pytest.raises(NoHall, match=r"--start 40 -20: the robot does not fit there; the nearest place is \d+\.\d\d -"):
+    assert "2 areas are not connected; give --start X Y" in said(apart)
+    with pytest.raises(
+        NoHall, match=r"--start 40 -20: the robot does not fit there; the nearest possible position is \d+\.\d\d -"
+    ):
         halls(0.4, Robot(0.6, (40.0, -20.0)))
 
 
@@ -81,7 +83,7 @@ def test_floor_behind_glass_is_left_out_and_named() -> None:
     assert halls(1.0, Robot(), driven(1)).places[:, 0].max() > 9.5, "somebody may have walked there once"
     glass = halls(1.0, Robot(), driven(2))
     assert glass.places[:, 0].max() < 6.4
-    assert "left out: 12 m2 that the lidar has seen only through glass" in said(glass)
+    assert "excluded: 12 m2 that the lidar measured only through glass" in said(glass)
 
 
 def test_somebody_who_walks_about_is_no_glass() -> None:
@@ -97,7 +99,7 @@ def test_somebody_who_walks_about_is_no_glass() -> None:
 def test_a_map_file_leaves_out_where_nobody_has_driven() -> None:
     hall = halls(0.4, Robot(), driven(0))
     assert hall.places[:, 0].max() < 6.4
-    assert "cannot reach from where it has driven" in said(hall)
+    assert "cannot reach from its recorded path" in said(hall)
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ def test_a_recorded_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     better = tmp_path / "better.toml"
     assert parser.main(["calibrate", str(tmp_path / "teach"), "--out", str(better)]) == console.OK
     said = capsys.readouterr().out
-    assert "not told by this drive" in said
+    assert "not determined by this drive" in said
     assert len(read_survey(better).lamps) == len(placed)
     wheels = ["--out", str(tmp_path / "robot.toml")]
     assert parser.main(["calibrate", str(tmp_path / "teach"), "--odometry", "--lidar-mount", *wheels]) == console.OK

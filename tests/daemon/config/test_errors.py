@@ -147,15 +147,15 @@ def test_the_example_of_each_option_is_one_that_is_taken() -> None:
         ("qqq = 1", "robot.toml:1: unknown key `qqq`; `lumiloop --print-config` lists all keys"),
         (
             '"lidar.device" = "a"',
-            'robot.toml:1: unknown key `"lidar.device"`: quotes make one name of it; did you mean `lidar.device`?',
+            'robot.toml:1: unknown key `"lidar.device"`: the quotes make this one name; did you mean `lidar.device`?',
         ),
         (
             '[lidar]\n"mount.x" = 0.1',
-            'robot.toml:2: unknown key `lidar."mount.x"`: quotes make one name of it; did you mean `lidar.mount.x`?',
+            'robot.toml:2: unknown key `lidar."mount.x"`: the quotes make this one name; did you mean `lidar.mount.x`?',
         ),
         (
             '["lidar.mask"]\nnear = 0.1',
-            'robot.toml:1: unknown key `"lidar.mask"`: quotes make one name of it; did you mean `lidar.mask`?',
+            'robot.toml:1: unknown key `"lidar.mask"`: the quotes make this one name; did you mean `lidar.mask`?',
         ),
         ('"a.b" = 1', 'robot.toml:1: unknown key `"a.b"`; `lumiloop --print-config` lists all keys'),
         (

@@ -68,7 +68,7 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ),
         (
             "[lidar]\ndevice = 'auto:a b'",
-            "robot.toml:2: `lidar.device`: expected a serial number behind `auto:`, as in auto:H0906091, got",
+            "robot.toml:2: `lidar.device`: expected a serial number after `auto:`, as in auto:H0906091, got",
         ),
         (
             "[lidar]\nserial = 'H1'",
@@ -76,7 +76,7 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ),
         (
             "lidar.baud = 19200",
-            "robot.toml:1: `lidar.baud` is now part of `lidar.device`: write the rate behind the path, as in",
+            "robot.toml:1: `lidar.baud` is now part of `lidar.device`: write the rate after the path, as in",
         ),
         (
             "allow = ['10.0.0.1/24']",
@@ -88,7 +88,7 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ),
         (
             "[modbus]\nserial = 'ttyUSB1'",
-            "robot.toml:2: `modbus.serial`: expected a path with its line rate and our unit, as in",
+            "robot.toml:2: `modbus.serial`: expected a path with line rate and unit, as in",
         ),
         (
             "[modbus]\nserial = '/dev/a@9601'",
@@ -96,15 +96,15 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ),
         (
             "[modbus]\nserial = '/dev/a@9600,7E1'",
-            "robot.toml:2: `modbus.serial`: expected a format of 8E1, 8O1, 8N1, 8N2 behind the rate, got",
+            "robot.toml:2: `modbus.serial`: expected a format of 8E1, 8O1, 8N1, 8N2 after the rate, got",
         ),
         (
             "[modbus]\nserial = '/dev/a#0'",
-            "robot.toml:2: `modbus.serial`: expected a unit from 1 to 247 behind `#`, got `/dev/a#0`",
+            "robot.toml:2: `modbus.serial`: expected a unit from 1 to 247 after `#`, got `/dev/a#0`",
         ),
         (
             "[lidar]\ndevice = '/dev/a@19200'\n[modbus]\nserial = '/dev/a#2'",
-            "robot.toml:4: `modbus.serial`: expected another line than the lidar's, got `/dev/a#2`",
+            "robot.toml:4: `modbus.serial`: expected a line that the lidar does not use, got `/dev/a#2`",
         ),
         (
             "[pose]\nreceivers = ['*:1', '*:2']",
@@ -145,17 +145,17 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ),
         (
             "[photodiode]\nconverter = 'mcp3221'",
-            "robot.toml:2: `photodiode.converter`: expected chip@address, as in mcp3221@0x4d, got `mcp3221`",
+            "robot.toml:2: `photodiode.converter`: expected type@address, as in mcp3221@0x4d, got `mcp3221`",
         ),
         ("[photodiode]\nconverter = 'mcp3221@0x20'", "Expected mcp3221@ADDRESS in `converter`, one of 0x48, 0x49"),
         (
             "[photodiode]\nconverter = 'ads1115@0x48'",
-            "robot.toml:2: `photodiode.converter`: chip ads1115: samples by a clock of its own, so it tells",
+            "robot.toml:2: `photodiode.converter`: converter ads1115: it samples by its own clock, so it measures",
         ),
         ("[photodiode]\nconverter = 'mcp3221@0x4d/0'", "Expected mcp3221@ADDRESS in `converter`"),
         (
             "[photodiode]\nlevel = 'ads1115@0x48'",
-            "robot.toml:2: `photodiode.level`: expected chip@address/channel beside the converter, got",
+            "robot.toml:2: `photodiode.level`: expected type@address/channel with another address",
         ),
         (
             "[photodiode]\nlevel = 'ads1115@0x20/1'",
@@ -163,7 +163,7 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
         ),
         (
             "[photodiode]\nconverter='mcp3221@0x48'\nlevel='ads1115@0x48/1'",
-            "robot.toml:3: `photodiode.level`: expected chip@address/channel beside the converter, got",
+            "robot.toml:3: `photodiode.level`: expected type@address/channel with another address",
         ),
         ("[photodiode]\nprofile = 'C'", "robot.toml:2: `photodiode.profile`: expected one of A, B, D, got `C`"),
         ("[lidar]\ndevice = 'none'", "expected a lidar, because `photodiode.bus` is empty"),
@@ -177,7 +177,7 @@ def test_a_wrong_value_is_refused_with_place_and_expectation(tmp_path: Path, tex
 
 @pytest.mark.parametrize("device", ["/dev/ttyACM0@baud", "/dev/ttyACM0@", "/dev/ttyUSB0@19201"])
 def test_what_is_no_line_rate_is_refused(device: str) -> None:
-    with pytest.raises(ValueError, match=r"Expected a line rate of 19200, .* behind `@`"):
+    with pytest.raises(ValueError, match=r"Expected a line rate of 19200, .* after `@`"):
         parse_lidar(device)
 
 
@@ -322,5 +322,5 @@ def test_wrong_endpoints(text: str) -> None:
 
 def test_a_character_that_no_name_can_have_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text('[lights]\nsurvey = "a\\u0000b"\n')
-    with pytest.raises(ConfigError, match=r"a\.toml:2: `lights\.survey` holds the character"):
+    with pytest.raises(ConfigError, match=r"a\.toml:2: `lights\.survey` contains the character"):
         load(tmp_path / "a.toml")

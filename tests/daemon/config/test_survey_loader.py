@@ -115,7 +115,7 @@ WRONG = [
     ("x = 1.0\n", "x = inf\n", ":5", "to 10000.0"),
     ("code = 17\nx = 1.0", "code = 513\nx = 1.0", ":4", "number of the CDMA code"),
     ("code = 17\nx = 1.0", "code = -1\nx = 1.0", ":4", "code"),
-    ("lamp_id = 4", "lamp_id = 2", ":9", "lamp 2: that `lamp_id` is taken already by line 2"),
+    ("lamp_id = 4", "lamp_id = 2", ":9", "lamp 2: another lamp has this `lamp_id` in line 2"),
     ("lamp_id = 4", 'lamp_id = "4"', ":3", 'lamp[0]: `lamp_id` = "4": expected a whole number, 0 to 65535'),
     (
         "y = 2.0\nz = 3.0\nhalf",
@@ -124,12 +124,12 @@ WRONG = [
         "unknown key `power`; did you mean `power_w`",
     ),
     ("z = 3.0\nhalf", "hight = 3.0\nhalf", ":7", "unknown key `hight`"),
-    ("z = 3.0\nhalf", "half", ":2", "lamp 4: `z` is missing: metres above the floor; as in z = 2.6"),
+    ("z = 3.0\nhalf", "half", ":2", "lamp 4: `z` is missing: metres above the ground; as in z = 2.6"),
     ("half_angle_deg = 60.0", "half_angle_deg = 60.0\norder = 1.0", ":2", "got both"),
-    ("half_angle_deg = 60.0", "half_angle_deg = 90.0", ":8", "angle at which intensity has halved"),
+    ("half_angle_deg = 60.0", "half_angle_deg = 90.0", ":8", "angle of half intensity"),
     ("z = 3.0\nhalf", "z = nan\nhalf", ":7", "lamp 4: `z` = nan"),
-    ("z = 3.0\nhalf", "z = 300.0\nhalf", ":7", "metres above the floor"),
-    ("x = 4.0", "x = 1.0", ":9", "hangs where lamp 4 hangs"),
+    ("z = 3.0\nhalf", "z = 300.0\nhalf", ":7", "metres above the ground"),
+    ("x = 4.0", "x = 1.0", ":9", "has the position of lamp 4"),
     ("depth = 0.3", "depth = 3.0", ":1", "`depth` = 3.0: expected a number, 0.002 to 0.95 (modulation depth"),
     ("depth = 0.3", "dept = 0.3", ":1", "did you mean `depth`"),
     ("x = 0.1", "x = 40.0", ":16", "receiver: `x` = 40.0: expected a number, -5.0 to 5.0 (metres ahead of the robot"),
@@ -176,16 +176,16 @@ def test_all_that_is_wrong_is_said_at_once_in_the_order_of_the_file(tmp_path: Pa
         (" lamp[5]: expected a table", "lamp_id, code"),
         ("1: `depth` = 3.0", "as in depth = 0.25"),
         ("2: unknown key `flor`", "did you mean `floor`?"),
-        ("4: lamp 1: code 130 is none of profile A", "0 to 128"),
+        ("4: lamp 1: code 130 is not in profile A", "0 to 128"),
         ("5: lamp 1: unknown key `hight`", "known here are"),
         ("5: lamp 1: `code` = -5", "as in code = 73"),
         ("5: lamp 1: `x` = nan", "as in x = 2.5"),
         ("5: lamp 1: `z` is missing", "as in z = 2.6"),
-        ("5: lamp 1: that `lamp_id` is taken already", "by line 4"),
+        ("5: lamp 1: another lamp has this `lamp_id`", "in line 4"),
         ("6: lamp[2]: `lamp_id` = 70000", "0 to 65535"),
-        ("6: lamp[2]: hangs where lamp 1 hangs by line 4", "delete one"),
+        ("6: lamp[2]: has the position of lamp 1 in line 4", "delete one"),
         ("7: lamp 4: expected `order` or `half_angle_deg`, got both", ""),
-        ("8: lamp 6: hangs at z = 2.1 m, not above the receiver", ""),
+        ("8: lamp 6: is at z = 2.1 m, not above the receiver", ""),
         ('13: receiver: `slope_x` = "a"', "as in slope_x = 0.0"),
     ]
     for line, (head, tail) in zip(told, expected, strict=True):
@@ -243,7 +243,7 @@ def test_codes_are_those_of_the_profile(tmp_path: Path, profile: Profile) -> Non
     path.write_text(GOOD.replace("code = 17", f"code = {last + 1}", 1))
     with pytest.raises(SurveyError) as error:
         read_survey(path, profile)
-    words = f":4: lamp 4: code {last + 1} is none of profile {profile.name}, which has codes 0 to {last}; "
+    words = f":4: lamp 4: code {last + 1} is not in profile {profile.name}, which has codes 0 to {last}; "
     if profile is PROFILE_D:
         words = ":4: lamp 4: `code` = 513: expected a whole number, 0 to 512"
     assert words in str(error.value)
@@ -266,7 +266,7 @@ def test_lines_are_found_in_the_written_form(tmp_path: Path) -> None:
     at = next(number for number, line in enumerate(lines) if "lamp_id = 7," in line)
     lines[at] = lines[at].replace("lamp_id = 7,", "lamp_id = 6,")
     path.write_text("\n".join(lines))
-    with pytest.raises(SurveyError, match=f":{at + 1}: lamp 6: .* taken already by line {at}$"):
+    with pytest.raises(SurveyError, match=f":{at + 1}: lamp 6: .* has this `lamp_id` in line {at}$"):
         read_survey(path)
     lines[at] = lines[at].replace("lamp_id = 6,", "lamp_id = 7, colour = 3,")
     path.write_text("\n".join(lines))

@@ -66,7 +66,7 @@ def test_a_damaged_file_is_said_and_replaced(tmp_path: Path, text: bytes, caplog
     (tmp_path / FILE).write_bytes(text)
     clock = SampleClock(CONFIG, tmp_path)
     assert clock.ppm is None
-    assert "is damaged and passed over" in caplog.text
+    assert "is damaged and ignored" in caplog.text
     learned(clock, 12.0)
     assert json.loads((tmp_path / FILE).read_text()) == {"/dev/i2c-1 mcp3221@0x4d A": 12.0}
 
@@ -91,7 +91,7 @@ def test_a_place_that_cannot_be_written_is_said_once_and_tried_again(
     for ppm in (100.0, 200.0, 300.0):
         learned(clock, ppm)
     assert clock.ppm == 300.0
-    assert len([record for record in caplog.records if "cannot be kept" in record.message]) == 1
+    assert len([record for record in caplog.records if "cannot store" in record.message]) == 1
     file.unlink()
     learned(clock, 300.0)
     assert SampleClock(CONFIG, file).ppm == 300.0, "though nothing is new"

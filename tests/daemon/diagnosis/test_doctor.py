@@ -38,7 +38,7 @@ POSE = Pose(seq=1, t_mono=1.0, t_sent=1.0, t_utc=1.7e9, state=3, state_name="TRA
 class Computer(Host):
     """One on which all is well, until something is changed."""
 
-    heard: Heard | Mute | str = "nobody listens there"
+    heard: Heard | Mute | str = "no daemon listens there"
     ttys: list[str] = field(default_factory=lambda: ["/dev/ttyACM0"])
     missing: set[str] = field(default_factory=set)
     closed: set[str] = field(default_factory=set)
@@ -116,7 +116,7 @@ def test_where_all_is_well_nothing_has_to_be_fixed(file: Path, capsys: pytest.Ca
     assert asked(file, computer) == console.OK
     said = capsys.readouterr().out
     assert computer.warmed_for == PhotodiodeConfig(bus=BUS)
-    assert said.endswith("nothing has to be fixed\n")
+    assert said.endswith("no problem was found\n")
     assert "FIX" not in said
     assert re.search(r"good +lidar +/dev/ttyACM0: UTM-30LX", said)
     assert re.search(r"good +survey .* 16 lamps", said)
@@ -126,8 +126,8 @@ def test_a_survey_that_is_not_there_is_named_with_its_line(file: Path, capsys: p
     (file.parent / "lights.toml").unlink()
     assert asked(file, Computer()) == console.FAILED
     said = capsys.readouterr().out
-    assert f"no such survey (`lumiloop survey` makes one from a drive) ({file}:4 names it: `lights.survey`)" in said
-    assert "-> put it there, or name another; `lumiloop check` reads it again" in said
+    assert f"no such survey; `lumiloop survey` makes one from a drive ({file}:4 names it with `lights.survey`)" in said
+    assert "-> create the file, or name another; then run `lumiloop check`" in said
 
 
 def test_a_survey_by_a_name_that_no_file_can_have_is_told_as_any_other(
@@ -150,30 +150,30 @@ ODD = Heard("agv", 7, POSE, AWRY, lamps={(5, 3): 1, (9, None): 7, (6, 4): 8, (7,
 FAULTY = Heard("agv", 7, POSE, Faults(present=(Fault(fault=104, meaning="no valid scan", remedy="check the cable"),)))
 
 CASES = {
-    "no lidar": (broken(ttys=[]), "lidar", "no serial device", "plug it in and give it power"),
+    "no lidar": (broken(ttys=[]), "lidar", "no serial device", "connect it and switch it on"),
     "no right to it": (
         broken(closed={"/dev/ttyACM0"}),
         "lidar",
-        "may not be opened by anna",
+        "access denied for anna",
         "usermod -aG dialout anna",
     ),
     "no answer": (
         broken(lidar=Finding("/dev/ttyACM0", error=DeviceFault("/dev/ttyACM0", "does not answer", "power it"))),
         *("lidar", "does not answer", "power it"),
     ),
-    "no bus": (broken(missing={BUS}), "photodiode", "not there", "may have to be enabled first"),
-    "no right to the bus": (broken(closed={BUS}), "photodiode", "may not be opened", "usermod -aG i2c anna"),
+    "no bus": (broken(missing={BUS}), "photodiode", "no such device", "enable the bus"),
+    "no right to the bus": (broken(closed={BUS}), "photodiode", "access denied for", "usermod -aG i2c anna"),
     "bus stuck": (broken(bus=TORN), "photodiode", "SDA is held low", "off and on"),
     "other converter": (
         broken(bus=WRONG),
         "photodiode",
-        "ADC121C021, configured is mcp3221",
-        "set photodiode.converter",
+        "ADC121C021, but mcp3221 is configured",
+        "correct `photodiode.converter`",
     ),
-    "no converter": (broken(bus=EMPTY), "photodiode", "no mcp3221 at 0x4d; there is 0x48", "check power, SDA and SCL"),
+    "no converter": (broken(bus=EMPTY), "photodiode", "no mcp3221 at 0x4d; found: 0x48", "check power, SDA and SCL"),
     "no time": (broken(t_utc=12.0), "clock", "before 2025", "timedatectl set-ntp true"),
-    "disk full": (broken(room=5 << 20), "disk", "5 MB are free", "free some space"),
-    "port taken": (broken(ports={1502: errno.EADDRINUSE}), "ports", "TCP 127.0.0.1:1502", "`ss -lnp` says who"),
+    "disk full": (broken(room=5 << 20), "disk", "5 MB are free", "free disk space there, or set"),
+    "port taken": (broken(ports={1502: errno.EADDRINUSE}), "ports", "TCP 127.0.0.1:1502", "`ss -lnp` shows which"),
     "no such address": (
         broken(ports={1502: errno.EADDRNOTAVAIL}),
         *("ports", "does not have that address", "set bind to an address of this computer"),
@@ -185,14 +185,19 @@ CASES = {
         "UDP 127.0.0.1:7000",
         "odometry.port",
     ),
-    "no cache": (broken(no_cache="no writable directory"), "kernels", "no writable directory", "a folder of its own"),
+    "no cache": (
+        broken(no_cache="no writable directory"),
+        "kernels",
+        "no writable directory",
+        "a folder with write access",
+    ),
     "kernels not stored": (
         broken(warmth=Warmth(True, 60.0, damaged=1, unwritten="/c/k: Read-only file system")),
-        *("kernels", "/c/k: Read-only file system; each start compiles them", "NUMBA_CACHE_DIR"),
+        *("kernels", "/c/k: Read-only file system); each start compiles them", "NUMBA_CACHE_DIR"),
     ),
     "a fault of the daemon": (broken(heard=FAULTY), "daemon", "fault 104: no valid scan", "check the cable"),
-    "not heard": (broken(heard=Mute("may not listen", "usermod")), "daemon", "may not listen", "usermod"),
-    "no pose": (broken(heard=Heard("agv", 7)), "daemon", "tells no pose", "see its log"),
+    "not heard": (broken(heard=Mute("has no access", "usermod")), "daemon", "has no access", "usermod"),
+    "no pose": (broken(heard=Heard("agv", 7)), "daemon", "runs, but publishes no pose", "read its log"),
     "no lamps": (broken(heard=Heard("agv", 7, POSE)), "lamps", "none is received", "covered"),
     "lamps that are all dead": (
         broken(heard=Heard("agv", 7, POSE, lamps={(6, 4): 8, (7, 5): 8})),
@@ -200,9 +205,9 @@ CASES = {
         "none is received",
         "covered",
     ),
-    "unsurveyed lamp": (broken(heard=ODD), "lamps", "code 9 is received, and no lamp", "add it"),
-    "dead lamp": (broken(heard=ODD), "lamps", "code 6 (lamp 4) should be received", "exchange it"),
-    "moved lamp": (broken(heard=ODD), "lamps", "code 7 (lamp 5) does not shine as surveyed", "survey it anew"),
+    "unsurveyed lamp": (broken(heard=ODD), "lamps", "code 9 is received, but no lamp", "add it"),
+    "dead lamp": (broken(heard=ODD), "lamps", "code 6 (lamp 4) is expected here", "switch it on or replace it"),
+    "moved lamp": (broken(heard=ODD), "lamps", "code 7 (lamp 5) differs from its survey", "survey it again"),
 }
 
 
@@ -223,10 +228,10 @@ def test_a_lamp_that_is_missing_is_not_in_view(file: Path, capsys: pytest.Captur
 
 REMARKS = {
     "cold": (broken(warmth=None), "kernels", "lumiloop warm"),
-    "kernels damaged": (broken(warmth=Warmth(True, 3.0, damaged=2)), "kernels", "the disk is failing"),
+    "kernels damaged": (broken(warmth=Warmth(True, 3.0, damaged=2)), "kernels", "check the disk"),
     "not synchronised": (broken(follows=False), "clock", "timedatectl"),
     "no real time": (broken(rights=False), "real time", "LimitRTPRIO"),
-    "not running": (broken(), "lamps", "start it"),
+    "not running": (broken(), "lamps", "start the daemon"),
 }
 
 
@@ -241,7 +246,7 @@ def test_what_works_worse_than_it_could_is_a_note(name: str, file: Path, capsys:
 def test_the_first_to_fix_is_named_last(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert asked(file, Computer(ttys=[], room=0, ports={1502: errno.EADDRINUSE})) == console.FAILED
     last = capsys.readouterr().out.splitlines()[-1]
-    assert last.startswith("4 to fix; first: disk: free some space")
+    assert last.startswith("4 to fix. Fix first: disk: free disk space")
 
 
 def test_files_that_are_wrong(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -250,7 +255,7 @@ def test_files_that_are_wrong(file: Path, tmp_path: Path, capsys: pytest.Capture
     assert "devise" in capsys.readouterr().out
     file.write_text(CONFIG + 'map.folder = "lumiloop.toml"\n')
     assert asked(file, Computer()) == console.FAILED
-    assert "is no folder" in capsys.readouterr().out
+    assert "this is not a folder" in capsys.readouterr().out
     (tmp_path / "lights.toml").write_text("lamp = 5")
     file.write_text(CONFIG)
     assert asked(file, Computer()) == console.FAILED
@@ -259,16 +264,16 @@ def test_files_that_are_wrong(file: Path, tmp_path: Path, capsys: pytest.Capture
 
 def test_another_sensor_than_the_one_configured(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert asked(file, Computer(), "lidar.device=auto:H1") == console.FAILED
-    assert "serial H0906091, configured is H1" in capsys.readouterr().out
+    assert "serial H0906091, but H1 is configured" in capsys.readouterr().out
 
 
 def test_lines_receivers_and_mounts_are_looked_at(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("modbus.serial=/dev/ttyS99@9600,8N1", 'pose.receivers=["nohost:5600", "*:5601"]', "lidar.mount.x=20")
     assert asked(file, Computer(missing={"/dev/ttyS99"}), *words) == console.FAILED
     said = capsys.readouterr().out
-    assert re.search(r"FIX +modbus +/dev/ttyS99: not there", said)
+    assert re.search(r"FIX +modbus +/dev/ttyS99: no such device", said)
     assert re.search(r"FIX +receivers +nohost:5600: Name or service not known", said)
-    assert re.search(r"note +configuration +`lidar.mount.x` = 20: metres", said)
+    assert re.search(r"note +configuration +`lidar.mount.x` = 20: check the unit, metres", said)
     assert asked(file, Computer(), words[0]) == console.OK
 
 
@@ -277,18 +282,20 @@ def test_a_folder_that_cannot_be_made_is_not_a_full_disk(file: Path, capsys: pyt
     assert asked(file, Computer(room=0)) == console.FAILED
     said = capsys.readouterr().out
     assert "FIX  maps" in said
-    assert "/proc/maps: cannot be made by this user" in said
+    assert "/proc/maps: this user cannot create the folder" in said
     assert "where /proc" not in said
 
 
-@pytest.mark.parametrize(("heard", "verdict"), [("nobody listens there", "FIX"), (Heard("lumiloop", 77, POSE), "good")])
+@pytest.mark.parametrize(
+    ("heard", "verdict"), [("no daemon listens there", "FIX"), (Heard("lumiloop", 77, POSE), "good")]
+)
 def test_a_folder_that_another_daemon_has_is_to_be_fixed_and_our_own_daemons_is_not(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], heard: Heard | str, verdict: str
 ) -> None:
     other = Store(tmp_path / "maps")
     other.claim()
     asked(file, Computer(heard=heard), f"map.folder={tmp_path / 'maps'}")
-    words = rf"{verdict} +maps +.*process {os.getpid()} keeps its maps there"
+    words = rf"{verdict} +maps +.*process {os.getpid()} stores its maps there"
     assert re.search(words, capsys.readouterr().out)
     other.close()
 
@@ -316,7 +323,7 @@ def test_a_running_daemon_is_listened_to(tmp_path: Path, monkeypatch: pytest.Mon
     assert heard.lamps == {(5, 12): 1, (6, None): 7}
     why = Host().listen(tmp_path / "none")
     assert isinstance(why, str)
-    assert "nobody listens" in why
+    assert "no daemon listens" in why
 
 
 def test_the_computer_itself_answers() -> None:
@@ -348,7 +355,7 @@ def test_a_daemon_that_cannot_be_heard_is_there_all_the_same(
         hung.listen()
         heard = Host().listen(tmp_path / "s")
     assert isinstance(heard, Mute)
-    assert "a daemon is there and says nothing" in heard.text
+    assert "a daemon is present, but its data cannot be used" in heard.text
     assert isinstance(Host().listen(tmp_path / "s"), str), "a socket that is left over is no daemon"
 
     def closed(path: Path) -> None:
@@ -368,7 +375,7 @@ def test_a_daemon_that_cannot_be_heard_is_there_all_the_same(
 
     assert asked(file, Opened(heard=heard)) == console.FAILED
     said = capsys.readouterr().out
-    assert "1 to fix; first: daemon: sudo usermod" in said
+    assert "1 to fix. Fix first: daemon: sudo usermod" in said
 
 
 @pytest.mark.parametrize("use", [3, 8])
@@ -377,14 +384,14 @@ def test_a_lamp_in_a_passing_shadow_is_nothing_to_fix(file: Path, capsys: pytest
     asked(file, Computer(heard=shaded))
     said = capsys.readouterr().out
     assert not re.search(r"FIX +lamps", said)
-    assert "at this moment" in said
+    assert "at present" in said
 
 
 def test_what_follows_from_a_fault_is_no_second_thing_to_fix(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    slow = Fault(fault=306, meaning="too slow", remedy="take load off")
-    stalled = Fault(fault=301, meaning="stalled", remedy="take load off", cause=306)
+    slow = Fault(fault=306, meaning="too slow", remedy="reduce the load")
+    stalled = Fault(fault=301, meaning="stalled", remedy="reduce the load", cause=306)
     asked(file, Computer(heard=Heard("agv", 7, POSE, Faults(present=(slow, stalled)))))
     said = capsys.readouterr().out
     assert re.search(r"FIX +daemon +fault 306: too slow", said)
     assert re.search(r"note +daemon +fault 301 follows from fault 306: stalled", said)
-    assert said.count("take load off") == 1 + said.endswith("daemon: take load off\n")
+    assert said.count("reduce the load") == 1 + said.endswith("daemon: reduce the load\n")

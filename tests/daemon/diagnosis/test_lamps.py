@@ -139,7 +139,7 @@ def test_a_value_that_stands_still_does_not_move_by_being_kept(tmp_path: Path) -
     [
         ("garbage\n", "its first line"),
         ("utc,lamp,ln_gain,sigma\n1,2,3\n", "line 2"),
-        ("utc,lamp,ln_gain,sigma\n1,2,nan,1\n", "cannot be"),
+        ("utc,lamp,ln_gain,sigma\n1,2,nan,1\n", "out of range"),
         ("", "its first line"),
     ],
 )
@@ -184,8 +184,8 @@ def test_the_command_gathers_from_maps_and_remembers_them(tmp_path: Path, capsys
     assert len(load(tmp_path / "lamps.csv")) == 2 * len(LAMPS)
     tell(args(folder, json=False), host)
     said = capsys.readouterr().out
-    assert "is not received where it must be" in said
-    assert said.splitlines()[-1].startswith("go to: lamp 4")
+    assert "is not received where it is expected" in said
+    assert said.splitlines()[-1].startswith("needs attention: lamp 4")
 
 
 def test_a_passing_shadow_sends_nobody_to_a_lamp(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -197,7 +197,7 @@ def test_a_passing_shadow_sends_nobody_to_a_lamp(tmp_path: Path, capsys: pytest.
     assert "no lamp is urgent" in capsys.readouterr().out
     heard.faults = Faults(present=(Fault(fault=int(Said.LAMP_MOVED)),))
     assert tell(args(tmp_path / "maps", json=False), Computer(t_utc=NOW, heard=heard)) == console.FAILED
-    assert capsys.readouterr().out.splitlines()[-1] == "go to: lamp 4"
+    assert capsys.readouterr().out.splitlines()[-1] == "needs attention: lamp 4"
 
 
 def test_that_no_daemon_was_heard_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -205,20 +205,20 @@ def test_that_no_daemon_was_heard_is_said(tmp_path: Path, capsys: pytest.Capture
     put_map(tmp_path / "maps", 1, NOW)
     assert tell(args(tmp_path / "maps"), Computer(t_utc=NOW)) == console.OK
     told = capsys.readouterr()
-    assert "dead or moved just now is not known, no daemon tells it: nobody listens there" in told.err
+    assert "no daemon reports which lamps are defective or moved at present: no daemon listens there" in told.err
     assert json.loads(told.out)
-    tell(args(tmp_path / "maps"), Computer(t_utc=NOW, heard=Mute("the socket: anna may not listen there", "")))
-    assert "may not listen" in capsys.readouterr().err
+    tell(args(tmp_path / "maps"), Computer(t_utc=NOW, heard=Mute("the socket: anna has no access", "")))
+    assert "has no access" in capsys.readouterr().err
 
 
 def test_where_nothing_is_known_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert tell(args(tmp_path / "maps"), Computer(t_utc=NOW)) == console.FAILED
-    assert "nothing is known of any lamp yet" in capsys.readouterr().err
+    assert "the history has no lamp yet" in capsys.readouterr().err
     none = Config(map=MapConfig(folder="none"))
     assert tell(args(tmp_path, settings=none), Computer()) == console.USAGE
     (tmp_path / "lamps.csv").write_text("x")
     assert tell(args(tmp_path / "maps"), Computer()) == console.FAILED
-    assert "is no history of lamps" in capsys.readouterr().err
+    assert "is not a lamp history" in capsys.readouterr().err
     assert replace(Verdict(1, Finding.GOOD), lamp=2).urgent is False
 
 
@@ -226,5 +226,5 @@ def test_it_makes_no_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     where = tmp_path / "none" / "lamps.csv"
     put_map(tmp_path / "maps", 1, NOW)
     assert tell(args(tmp_path / "maps", history=where), Computer()) == console.USAGE
-    assert f"--history {where}: there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
+    assert f"--history {where}: no such folder: {tmp_path / 'none'}; make it" in capsys.readouterr().err
     assert not where.parent.exists()

@@ -41,13 +41,13 @@ def head(told: list[Moment], after: float, wide: float = 1.0) -> str:
 @pytest.mark.parametrize(
     ("after", "fault", "says"),
     [
-        ((5.5, 6.01), 6.12, "nothing changes in it, but 0.12 s after it"),
+        ((5.5, 6.01), 6.12, "nothing changes in it; state, reason or faults change 0.12 s after it"),
         ((5.5, 6.01), 6.2, "nothing changes, cycle of"),
-        ((5.5,), 6.95, "nothing changes in it, but 0.95 s after it"),
+        ((5.5,), 6.95, "nothing changes in it; state, reason or faults change 0.95 s after it"),
         ((5.5,), 7.05, "nothing changes, cycle of"),
-        ((5.5,), 6.0, "nothing changes in it, but 0.00 s after it"),
+        ((5.5,), 6.0, "nothing changes in it; state, reason or faults change 0.00 s after it"),
         ((5.5, 6.0), 6.3, "nothing changes, cycle of"),
-        ((4.5,), 5.0, "first change in it"),
+        ((4.5,), 5.0, "first change of state, reason or faults in it"),
     ],
 )
 def test_what_is_published_after_a_second_counts_for_as_long_as_it_may_be_of_it(
@@ -79,8 +79,8 @@ def test_what_is_judged_of_a_boundary_is_what_is_printed_of_it(begun: float) -> 
     one = moment_of(AT, entry, record, cycle)
     assert of_day(one.utc).endswith(":25.000")
     told = [replace(WELL, utc=AT + 4.5), one]
-    assert "first change in it" in head(told, 5.0)
-    assert "but 0.00 s after it" in head(told, 4.0)
+    assert "first change of state, reason or faults in it" in head(told, 5.0)
+    assert "change 0.00 s after it" in head(told, 4.0)
 
 
 def test_of_a_second_of_which_a_part_is_recorded_that_part_is_told() -> None:
@@ -88,9 +88,11 @@ def test_of_a_second_of_which_a_part_is_recorded_that_part_is_told() -> None:
     assert "22:13:25.400+0000, the rest of that second: nothing changes, cycle" in head(
         cycles(5.5, 6.1, fault=6.3), 5.4, 0.6
     )
-    assert "nothing changes in it, but 0.05 s after it" in head(cycles(5.5, fault=6.05), 5.4, 0.6)
-    assert "first change in it" in head(cycles(5.5, fault=5.999), 5.4, 0.6)
-    assert "but 0.00 s after it" in head(cycles(5.5, fault=6.0), 5.4, 0.6)
+    assert "nothing changes in it; state, reason or faults change 0.05 s after it" in head(
+        cycles(5.5, fault=6.05), 5.4, 0.6
+    )
+    assert "first change of state, reason or faults in it" in head(cycles(5.5, fault=5.999), 5.4, 0.6)
+    assert "change 0.00 s after it" in head(cycles(5.5, fault=6.0), 5.4, 0.6)
     told = cycles(5.3, 6.2, fault=9.0)
     assert chosen(told, AT + 5.4, second=True, wide=0.6).cycle == 0, "none ran in that part"
 
@@ -99,11 +101,13 @@ def test_a_second_that_does_not_begin_with_one_of_the_clock_is_named_with_its_be
     """That is a number of seconds since a recording began."""
     said = head(cycles(5.5, fault=6.3), 5.4)
     assert (
-        "22:13:25.400+0000, the second from then: state, reason or faults first change in it, cycle of 22:13:26.300"
+        "22:13:25.400+0000, the second from then: first change of state, reason or faults in it, cycle of 22:13:26.300"
         in said
     )
     assert "22:13:25+0000, the whole second: " in head(cycles(5.5, fault=5.7), 5.0)
-    assert "22:13:25.400+0000, no cycle ran then; the last before it, 5 s earlier" in head(cycles(0.1, fault=0.2), 5.4)
+    assert "22:13:25.400+0000, without a cycle; the last one before ran 5 s earlier" in head(
+        cycles(0.1, fault=0.2), 5.4
+    )
 
 
 def test_before_its_first_cycle_no_time_is_less_than_none() -> None:

@@ -82,7 +82,7 @@ def test_every_reader_of_registers_groups_without_the_daemon() -> None:
 def test_the_line_says_what_took_the_time() -> None:
     text = describe(Fault.COMPUTER_SLOW, STARVED, BEFORE)
     assert text.startswith("fault 306: the computer is too slow")
-    assert text.endswith("had the processor for 4.0 of 10 s, 80 of 400 cycles were over their budget")
+    assert text.endswith("used the processor for 4.0 of 10 s, 80 of 400 cycles exceeded their budget")
 
 
 class Loaded:

@@ -60,7 +60,7 @@ def test_loss_and_return_are_one_line_each(caplog: pytest.LogCaptureFixture) -> 
     supervisor, _ = supervise(third_time_lucky, 30.0)
     assert supervisor.failed == set()
     assert [record.message for record in caplog.records] == [
-        "modbus: Modbus on 127.0.0.1:1502: port in use (stop the other program); trying again until it works",
+        "modbus: Modbus on 127.0.0.1:1502: port in use (stop the other program); the daemon tries again until it works",
         "modbus works again",
     ]
 
@@ -78,7 +78,9 @@ def test_a_defect_is_logged_in_full_and_the_part_restarted(caplog: pytest.LogCap
 
     supervisor, _ = supervise(defect, 300.0)
     assert supervisor.restarts.total() >= 10
-    lost = [record for record in caplog.records if "modbus has failed; it is restarted" in record.message]
+    lost = [
+        record for record in caplog.records if "component modbus has failed; the daemon restarts it" in record.message
+    ]
     assert [str(record.exc_info[1]) for record in lost if record.exc_info] == [
         "a defect", "another", "a defect", "a defect"
     ]  # fmt: skip

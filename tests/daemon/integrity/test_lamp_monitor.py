@@ -97,10 +97,10 @@ def test_each_lamp_is_named_once_in_the_log_and_once_when_it_is_well(caplog: pyt
     watch.see(30.0, ACCEPTED, REJECTED, MISSING, ACCEPTED, ACCEPTED)
     watch.see(2.0, ACCEPTED, ACCEPTED, ACCEPTED)
     assert [record.message for record in caplog.records] == [
-        "lamp 101 (code 11) does not shine as surveyed: moved, exchanged, or its power is another",
-        "lamp 102 (code 12) is not received where it must be: dead, switched off, or covered",
-        "lamp 101 (code 11) is received as it should be again",
-        "lamp 102 (code 12) is received as it should be again",
+        "lamp 101 (code 11) differs from its survey: it was moved, exchanged, or its power has changed",
+        "lamp 102 (code 12) is not received where it is expected: defective, off, or covered",
+        "lamp 101 (code 11) is received as expected again",
+        "lamp 102 (code 12) is received as expected again",
     ]
 
 

@@ -47,7 +47,7 @@ def test_a_bound_that_never_comes_within_the_limit_is_said_once_it_has_had_the_t
         run(alarm, [0.01] * 20, 50.0)
     assert not alarm.said
     assert len(caplog.messages) == 2
-    assert "the limit of 0.02 m" in caplog.messages[0]
+    assert "`integrity.alert_m`: 0.02 m" in caplog.messages[0]
 
 
 def test_a_start_whose_bound_settles_is_no_alarm(caplog: pytest.LogCaptureFixture) -> None:
@@ -68,8 +68,8 @@ def test_one_cycle_above_the_limit_raises_it_and_it_is_said_once(
         assert alarm.said
         assert len(caplog.messages) == 1
         assert "integrity.alert_m" in caplog.messages[0]
-        assert "limit of 0.5 m" in caplog.messages[0]
-        assert ("no bound" in caplog.messages[0]) == (bad is None or not math.isfinite(bad))
+        assert "`integrity.alert_m`: 0.5 m" in caplog.messages[0]
+        assert ("no protection level" in caplog.messages[0]) == (bad is None or not math.isfinite(bad))
         after = run(alarm, [0.2] * 20, 3.0)
     assert after[0]
     assert not after[-1]

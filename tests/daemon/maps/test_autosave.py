@@ -236,5 +236,5 @@ async def test_a_stop_does_not_wait_for_ever(
     monkeypatch.setattr(autosave, "STOP_S", 0.1)
     monkeypatch.setattr(bench.autosaver, "_packed", lambda image: time.sleep(0.6))
     await bench.autosaver.finish()
-    assert "the one before stays" in caplog.text
+    assert "the previous one remains" in caplog.text
     await asyncio.sleep(0.7)

@@ -45,9 +45,9 @@ async def test_a_folder_of_another_process_is_a_fault_from_the_start_until_a_sav
     bench.drive()
     await bench.turn(FIRST_S)
     assert autosaver.fault
-    assert caplog.text.count("another process keeps its maps there") == 1
+    assert caplog.text.count("another process stores its maps there") == 1
     await autosaver.finish()
-    assert "it is tried again" not in caplog.text
+    assert "the daemon tries again" not in caplog.text
     other.close()
     bench.drive()
     await bench.turn(RETRY_S)
@@ -71,7 +71,7 @@ def test_a_folder_that_has_become_free_is_no_fault_any_more_though_there_is_noth
         for _ in range(3):
             await bench.turn(LOOK_S)
             assert autosaver.fault
-        assert caplog.text.count("another process keeps its maps there") == 1
+        assert caplog.text.count("another process stores its maps there") == 1
         other.close()
         await bench.turn(LOOK_S)
         assert not autosaver.fault
@@ -83,7 +83,7 @@ def test_a_folder_that_has_become_free_is_no_fault_any_more_though_there_is_noth
 
     with caplog.at_level(logging.INFO):
         asyncio.run(run())
-    assert f"maps can be kept in {tmp_path} from now on" in caplog.text
+    assert f"maps can be stored in {tmp_path} again" in caplog.text
 
 
 async def test_what_is_wrong_with_the_folder_may_change(tmp_path: Path) -> None:

@@ -36,8 +36,8 @@ def test_each_turn_of_it_is_said_once_with_the_map_that_it_is_of(caplog: pytest.
     said = [record.levelname for record in caplog.records]
     assert said == ["INFO", "INFO", "INFO", "INFO", "WARNING"], "a RESET ends it without a word"
     assert all("00000abc" in record.getMessage() for record in caplog.records)
-    assert "has been found" in caplog.records[1].getMessage()
-    assert "nowhere" in caplog.records[-1].getMessage()
+    assert "was found. The map is now aligned" in caplog.records[1].getMessage()
+    assert "was not found" in caplog.records[-1].getMessage()
 
 
 @pytest.mark.jit

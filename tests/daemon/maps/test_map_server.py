@@ -41,17 +41,17 @@ def test_other_ways_to_write_it() -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("image: map.pgm\n", ""), "has no `image`"),
+        (("image: map.pgm\n", ""), "`image` is missing"),
         (("0.05", "0"), "`resolution` is 0 m"),
         (("0.05", "five"), "`resolution` is five; it must be a number"),
         (("[-1.0, 2.0, 0.5]", "[1]"), "`origin` must be"),
         (("[-1.0, 2.0, 0.5]", "[1, 2, x]"), "`origin` is x"),
-        (("[-1.0, 2.0, 0.5]", "[1, 2,"), "has no end"),
+        (("[-1.0, 2.0, 0.5]", "[1, 2,"), "without an end"),
         (("negate: 0", "negate: 2"), "`negate` is 2"),
         (("free_thresh: 0.196", "free_thresh: 0.7"), "free the smaller"),
         (("negate: 0", "negate: 0\nmode: fancy"), "`mode` is fancy"),
         (("negate: 0", "nonsense"), "line 4 is not `key: value`: nonsense"),
-        (("negate: 0", "image: b.pgm"), "says `image` a second time"),
+        (("negate: 0", "image: b.pgm"), "repeats `image`"),
     ],
 )
 def test_what_is_wrong_is_said(change: tuple[str, str], says: str) -> None:
@@ -99,14 +99,14 @@ def test_plain_pgm_and_comments() -> None:
         (b"MZ\x90", "neither PGM, PNG, BMP, JPEG, TIFF nor GIF"),
         (b"GIF89a", "neither PGM, PNG, BMP, JPEG, TIFF nor GIF"),
         (b"P5\n1234567890 1\n255\n", "a number that is too large"),
-        (b"P2\n2 1\n255\n0 -1", "something else than whole numbers"),
+        (b"P2\n2 1\n255\n0 -1", "contains text that is not a whole number"),
         (b"P2\n2 1\n255\n", "ends after 0 of its 2 pixels"),
         (b"P2\n1 1\n255\n99999999999999999999999", "beyond its largest"),
-        (b"P5 3", "its head is not that of a PGM"),
+        (b"P5 3", "its head is not a PGM head"),
         (b"P5\n3 2\n255\n12345", "ends after 5 of its 6 pixels"),
         (b"P5\n30000 20000\n255\n", "30000 x 20000 pixels"),
         (b"P5\n3 2\n70000\n", "largest value"),
-        (b"P2\n1 1\n255\nx", "something else than whole numbers"),
+        (b"P2\n1 1\n255\nx", "contains text that is not a whole number"),
         (b"P2\n1 1\n9\n10", "beyond its largest"),
     ],
 )
@@ -151,7 +151,7 @@ def test_a_map_of_two_files(tmp_path: Path) -> None:
     Image.fromarray(GREYS).save(tmp_path / "map.pgm")
     assert load(tmp_path / "floor.yaml")[1].tolist() == [[-1, 1, 0], [1, 0, -1]]
     (tmp_path / "x.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(BadMapServer, match="is not text"):
+    with pytest.raises(BadMapServer, match="not a text file"):
         load(tmp_path / "x.yaml")
     with pytest.raises(BadMapServer, match="cannot be read"):
         load(tmp_path / "none.yaml")
@@ -171,5 +171,5 @@ def test_no_bytes_do_more_than_be_refused(head: bytes, data: bytes) -> None:
 
 def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_bytes(b"image: a\0b.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
-    with pytest.raises(BadMapServer, match="`image` must be the name of a picture"):
+    with pytest.raises(BadMapServer, match="`image` must be the name of an image file"):
         load(tmp_path / "a.yaml")

@@ -59,7 +59,7 @@ def test_only_files_are_read(folder: Path, monkeypatch: pytest.MonkeyPatch, kind
         Path("link").symlink_to("it")
     name = Path("link" if linked else "it")
     begun = time.monotonic()
-    with pytest.raises(BadMapServer, match=rf"floor.yaml: the picture {name} is {kind}, not a file|out of its folder"):
+    with pytest.raises(BadMapServer, match=rf"floor.yaml: the image {name} is {kind}, not a file|outside its folder"):
         load(described(Path(), str(name)))
     with pytest.raises(BadMapServer, match=f"{name}: is {kind}, not a file; name map_server's YAML file"):
         load(name)
@@ -102,16 +102,16 @@ def test_links_lead_nowhere_else(folder: Path, image: str) -> None:
 def test_sizes_have_limits(tmp_path: Path) -> None:
     path = tmp_path / "big"
     path.write_bytes(b"x" * 11)
-    with pytest.raises(FileRefused, match="has 11 bytes; at most 10"):
+    with pytest.raises(FileRefused, match="has 11 bytes; the limit is 10"):
         read_regular(path, 10)
     assert read_regular(path, 11) == b"x" * 11
     with pytest.raises(FileRefused, match="has more than 10 bytes"):
         read_regular(Path("/proc/self/status"), 10)  # a file that states no size
     with path.open("r+b") as file:
         file.truncate(1 << 40)  # takes no room
-    with pytest.raises(BadMapServer, match="big: has 1099511627776 bytes; at most 65536 can be read"):
+    with pytest.raises(BadMapServer, match="big: has 1099511627776 bytes; the limit is 65536"):
         load(path)
-    with pytest.raises(BadMapServer, match=r"the picture .*big has 1099511627776 bytes"):
+    with pytest.raises(BadMapServer, match=r"the image .*big has 1099511627776 bytes"):
         load(described(tmp_path, "big"))
 
 

@@ -76,7 +76,7 @@ def test_of_other_maps_the_newest_generation_is_kept_of_the_seven_latest(
         store.save(content(Shape(map_id=map_id), 1), map_id)
     kept = names(tmp_path)
     assert kept == sorted([name(2 * k, k) for k in range(2, 10)] + [name(17, 9)])
-    assert "maps of other places are newer" in caplog.text
+    assert "maps of other areas are newer" in caplog.text
 
 
 def test_a_good_generation_of_another_map_stays_where_the_newer_one_is_broken(
@@ -117,7 +117,10 @@ def test_a_broken_map_is_kept_aside_and_the_generation_before_it_loaded(
     assert start.content == content(seed=1)
     assert store.refused
     assert names(tmp_path) == [name(1), name(2, more=".broken")]
-    for said in (f"{broken}.broken is refused", f"{tmp_path / name(1)} is used, the newest good generation"):
+    for said in (
+        f"{broken}.broken is refused",
+        f"{tmp_path / name(1)} is used, the newest valid generation of this map",
+    ):
         assert said in caplog.text
     store.save(content(seed=3), MAP)
     assert names(tmp_path) == [name(1), name(2, more=".broken"), name(3)]
@@ -132,13 +135,13 @@ def test_a_map_of_a_newer_version_is_left_alone(tmp_path: Path, caplog: pytest.L
     assert start is not None
     assert start.content == content(seed=1)
     assert names(tmp_path) == [name(1), name(2)]
-    assert "is of version 2, and this software knows them up to 1; install that version again" in caplog.text
+    assert "has version 2; this software reads versions up to 1; install that version" in caplog.text
 
 
 def test_a_map_under_another_maps_name_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     tmp_path.joinpath(name(1, 0x9999)).write_bytes(content())
     assert Store(tmp_path).load() is None
-    assert "it holds map 00001234, another than its name says" in caplog.text
+    assert "it contains map 00001234, which differs from its name" in caplog.text
     assert names(tmp_path) == [name(1, 0x9999, ".broken")]
 
 
@@ -150,14 +153,14 @@ def test_what_was_forgotten_does_not_come_back_where_the_new_map_is_broken(
     store.close()
     tmp_path.joinpath(name(2, 5)).write_bytes(b"")
     assert started(MapConfig(folder=str(tmp_path)), None)[1] is None
-    assert "a new one is begun" in caplog.text
+    assert "the daemon begins a new" in caplog.text
     assert "is used" not in caplog.text
 
 
 def test_who_only_looks_says_nothing_of_what_is_begun(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     tmp_path.joinpath(name(1)).write_bytes(content()[:900])
     assert Store(tmp_path, mend=False).load() is None
-    assert "it ends" in caplog.text or "cut off" in caplog.text
+    assert "the file ends" in caplog.text or "truncated" in caplog.text
     assert "begun" not in caplog.text
     assert "is used" not in caplog.text
 
@@ -180,7 +183,7 @@ def test_each_building_has_its_own_map(tmp_path: Path, caplog: pytest.LogCapture
     assert store is not None
     assert store.refused
     assert len(names(tmp_path)) == 2
-    assert "name the survey that it was made with in `lights.survey`" in caplog.text
+    assert "name the survey of this map in `lights.survey`" in caplog.text
 
 
 def test_a_survey_that_has_changed_is_said_and_the_map_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -198,12 +201,12 @@ def test_a_torn_map_is_kept_aside_whole(tmp_path: Path, caplog: pytest.LogCaptur
     assert start is not None
     assert len(start.stored.tables["submap.key"]) == 6
     assert names(tmp_path) == [name(1), name(1, more=".torn")]
-    assert "2 of its submaps are joined with the rest by nothing and are left out" in caplog.text
+    assert "2 submaps have no edge to the others and are not used" in caplog.text
 
 
 def test_a_map_that_is_to_be_used_as_it_is_has_to_be_there(tmp_path: Path) -> None:
     config = MapConfig(folder=str(tmp_path), localise=True)
-    with pytest.raises(NoMap, match=f"{tmp_path}: holds no map that can be used") as caught:
+    with pytest.raises(NoMap, match=f"{tmp_path}: the folder has no usable map") as caught:
         started(config, None)
     assert "lumiloop map import" in str(caught.value)
     store_with(tmp_path, 1).close()
@@ -266,7 +269,7 @@ def test_maps_that_are_not_looked_at_because_the_latest_is_broken_are_named(
     tmp_path.joinpath(name(9, 5)).write_bytes(b"no map")
     tmp_path.joinpath("good.lumimap").write_bytes(content(seed=3))
     assert Store(tmp_path).load() is None
-    assert "not looked at, being of other maps: good.lumimap; to use one, move the others out" in caplog.text
+    assert "files of other maps are not used: good.lumimap; to use one, move the others away" in caplog.text
 
 
 def test_a_map_of_another_building_was_looked_at(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -276,7 +279,7 @@ def test_a_map_of_another_building_was_looked_at(tmp_path: Path, caplog: pytest.
     tmp_path.joinpath(name(5, 5)).write_bytes(b"no map")
     tmp_path.joinpath("good.lumimap").write_bytes(content(seed=3))
     assert started(MapConfig(folder=str(tmp_path)), Lights(SURVEY, PROFILE_A))[1] is None
-    assert "not looked at, being of other maps: good.lumimap;" in caplog.text
+    assert "files of other maps are not used: good.lumimap;" in caplog.text
 
 
 def test_a_map_to_be_used_as_it_is_is_known_as_such_to_the_estimator(tmp_path: Path) -> None:

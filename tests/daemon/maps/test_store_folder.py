@@ -54,7 +54,7 @@ def test_a_folder_that_was_made_anew_has_a_lock_of_its_own(tmp_path: Path) -> No
     with pytest.raises(BlockingIOError):
         first.save(content(seed=3), MAP)
     first.claim()
-    assert "another process keeps its maps there" in first.trouble
+    assert "another process stores its maps there" in first.trouble
     second.close()
     first.claim()
     assert first.trouble == ""
@@ -130,7 +130,7 @@ def test_a_disk_that_keeps_lying_is_not_filled_with_what_it_has_spoilt(
     write = module.write_whole
     monkeypatch.setattr(module, "write_whole", lambda path, data: write(path, data[:-50] + bytes(50)))
     for _ in range(module.MOST_BROKEN + 3):
-        with pytest.raises(Damaged, match="the disk is failing"):
+        with pytest.raises(Damaged, match="check the disk"):
             store.save(content(seed=2), MAP)
     last = 1 + module.MOST_BROKEN + 3
     kept = [name(k, more=".broken") for k in range(last - module.MOST_BROKEN + 1, last + 1)]
@@ -141,7 +141,7 @@ def test_a_disk_that_lies_is_found_out(tmp_path: Path, monkeypatch: pytest.Monke
     store = store_with(tmp_path, 1)
     write = module.write_whole
     monkeypatch.setattr(module, "write_whole", lambda path, data: write(path, data[:-50] + bytes(50)))
-    with pytest.raises(Damaged, match="the disk is failing"):
+    with pytest.raises(Damaged, match="check the disk"):
         store.save(content(seed=2), MAP)
     assert names(tmp_path) == [name(1), name(2, more=".broken")]
     start = Store(tmp_path).load()
@@ -163,7 +163,7 @@ def test_a_second_daemon_on_one_folder_is_told_at_its_start(tmp_path: Path, capl
     second, _ = started(settings, None)
     assert second is not None
     assert "another process" in second.trouble
-    assert f"no map can be kept in {tmp_path}: another process keeps its maps there" in caplog.text
+    assert f"no map can be stored in {tmp_path}: another process stores its maps there" in caplog.text
     first.close()
     caplog.clear()
     started(settings, None)
@@ -205,5 +205,5 @@ def test_a_folder_that_cannot_be_read_is_said(tmp_path: Path, caplog: pytest.Log
     store = Store(file)
     with caplog.at_level(logging.ERROR):
         assert store.load() is None
-    assert f"maps in {file} cannot be read: Not a directory; mend that, or name another `map.folder`" in caplog.text
+    assert f"maps in {file} cannot be read: Not a directory; correct that, or name another `map.folder`" in caplog.text
     assert store.refused

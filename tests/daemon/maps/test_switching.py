@@ -127,7 +127,7 @@ def test_the_robot_goes_on_in_another_map_and_the_replay_repeats_it(
         running = asyncio.create_task(bench.daemon.run(stop))
         await asyncio.sleep(20.0)
         assert await bench.switch(second) == switching.IN_USE
-        assert "there is no map 00000bad" in await bench.switch(0xBAD)
+        assert "no map 00000bad in" in await bench.switch(0xBAD)
         assert await bench.switch(first) == ""
         await asyncio.sleep(35.0)
         stop.set()
@@ -241,12 +241,12 @@ def asked(store: Store | None, autosaver: Quiet, **maps: Any) -> str:
 def test_what_cannot_be_carried_out_says_why(tmp_path: Path) -> None:
     assert asked(None, Quiet()) == switching.NO_FOLDER
     assert asked(Store(tmp_path), Quiet(ready=False)) == switching.NOT_LOADED
-    assert asked(Store(tmp_path), Quiet()).endswith("there are: none")
+    assert asked(Store(tmp_path), Quiet()).endswith("available maps: none")
     path = tmp_path / f"map-{SECOND:08x}-00000001.lumimap"
     path.write_bytes(b"rubbish")
     assert "map 00002000 cannot be used" in asked(Store(tmp_path, mend=False), Quiet())
     path.write_bytes(content())
-    assert "another than its name says" in asked(Store(tmp_path, mend=False), Quiet())
+    assert ", which differs from its name" in asked(Store(tmp_path, mend=False), Quiet())
     assert asked(Store(tmp_path), Quiet("the disk is full")) == "the map in use cannot be saved: the disk is full"
 
 
@@ -276,7 +276,7 @@ def test_a_defect_and_a_full_disk_change_nothing_and_are_told(tmp_path: Path, ca
     assert asyncio.run(go()) == ""
     assert "No space left on device" in asyncio.run(go(keep=full))
     assert asyncio.run(go(make=defect)) == "ZeroDivisionError('a defect')"
-    assert "the map cannot be switched" in caplog.text
+    assert "switching the map has failed" in caplog.text
 
 
 def test_a_map_that_no_cycle_takes_is_taken_back_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,7 @@ FIRST_STATE_S = 33.0
 @pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("lit", [False, True], ids=["laser", "laser and light"])
+@pytest.mark.parametrize("lit", [False, True], ids=["laser", "lidar and light"])
 def test_nothing_is_compiled_once_it_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lit: bool) -> None:
     """With a recorder, which loads more than a start without."""
     cache, link = tmp_path / "cache", tmp_path / "lidar"

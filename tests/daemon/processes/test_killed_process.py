@@ -73,7 +73,7 @@ def test_a_robot_that_stands_is_tracking_again_soon_after_a_kill(tmp_path: Path)
             tracking_s = processor_s(daemon.process.pid)
             code, log, _ = daemon.stop()
     assert code == 0, log
-    assert "the robot was last at" in log
+    assert "the last stored pose is x" in log
     assert ready["map_id"] == after["map_id"] == before["map_id"]
     for axis in ("map_x", "map_y", "map_yaw"):
         was, now = before[axis], after[axis]

@@ -35,7 +35,10 @@ def test_one_of_the_same_name_runs_already(
         assert parser.main([*command, "name=bay4"]) == console.FAILED
         assert "already" not in caplog.text
         assert parser.main([*command, "name=bay3"]) == console.FAILED
-        assert f"a daemon named bay3 runs on this computer already ({tmp_path / where / 'bay3.stream'})" in caplog.text
+        assert (
+            f"a daemon with the name bay3 runs on this computer already ({tmp_path / where / 'bay3.stream'})"
+            in caplog.text
+        )
     caplog.clear()
     assert parser.main([*command, "name=bay3"]) == console.FAILED  # what a dead one has left is none
     assert "already" not in caplog.text

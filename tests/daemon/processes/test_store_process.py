@@ -88,4 +88,4 @@ def test_localisation_without_a_map_is_refused_at_the_start(tmp_path: Path) -> N
     with running(tmp_path / "lidar", "--set", f"map.folder={tmp_path}", "--set", "map.localise=true") as daemon:
         _, log = daemon.process.communicate(timeout=30.0)
     assert daemon.process.returncode == 1
-    assert f"{tmp_path}: holds no map that can be used, and `map.localise` is true" in log
+    assert f"{tmp_path}: the folder has no usable map, but `map.localise` is true" in log

@@ -89,8 +89,8 @@ def test_a_container_s_daemon_answers_at_the_port_that_is_published_for_it(tmp_p
     found = computer.whose()
     assert not found.another
     assert str(found) == (
-        f"process {OTHER}: /usr/bin/docker-proxy -proto udp (the configured name is that of process {MEANT}, which "
-        "has a network of its own)"
+        f"process {OTHER}: /usr/bin/docker-proxy -proto udp (the configured name belongs to process {MEANT} in "
+        "another network namespace)"
     )
 
 

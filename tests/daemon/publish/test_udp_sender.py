@@ -305,7 +305,7 @@ async def test_an_interface_that_comes_back_with_another_number_is_found_again()
 
 async def test_an_interface_that_is_not_there_is_named_with_those_that_are(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    with pytest.raises(DeviceMissing, match=r"no network interface eth77 on this computer \(name one .*lo"):
+    with pytest.raises(DeviceMissing, match=r"no network interface eth77 on this computer \(name an existing one.*lo"):
         await inet.resolve("ff15::42%eth77", 5000)
     sender = PoseSender(["[ff15::42%eth77]:5000"])
     await sender.start()

@@ -128,7 +128,7 @@ def test_a_full_disk_is_counted_and_said_and_survived(
     assert "No space left" in note
     assert not report.skipped  # nothing is torn: what was half written has been cut off
     assert caplog.text.count("has stopped") == 1
-    assert caplog.text.count("recording goes on") == 1
+    assert caplog.text.count("recording continues in") == 1
 
 
 def test_memory_that_runs_out_is_counted_and_said_and_survived(
@@ -208,7 +208,7 @@ def test_a_place_that_cannot_be_written_at_the_start_is_tried_again(
     place.write_text("")
     recorder = Recorder(place, Config(), SystemClock(), Lights(SURVEY, PROFILE_A, None, b"a map"), keep_s=keep_s)
     assert recorder.failing == {"recorder"}
-    assert f"recording into {recorder.disk.folder} has stopped: Not a directory" in caplog.text
+    assert f"recording to {recorder.disk.folder} has stopped: Not a directory" in caplog.text
     recorder.disk.put(Kind.RX, 0, 1.0, b"lost")
     wait_for(lambda: recorder.disk.lost == 1)
     place.unlink()

@@ -108,7 +108,7 @@ async def asked(bench: Bench) -> None:
             break
     assert said == [""]
     bench.recorder.box.dump(refused.append)
-    assert refused[1].startswith("one was made a moment ago; another can be made in ")
+    assert refused[1].startswith("the last dump is too recent; ")
     bench.recorder.box._ask_from = 0.0
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench.recorder.box, "_begin", broken)

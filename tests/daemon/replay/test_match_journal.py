@@ -157,7 +157,7 @@ def test_a_journal_changes_no_result_and_is_the_same_twice(log: Path, out: Path,
 
 def test_what_failed_is_written_with_its_reason(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert parser.main(["replay", str(log), "--out", str(tmp_path), "--journal", "failed"]) == console.OK
-    assert "5 matches were no result" in capsys.readouterr().err
+    assert "5 matches failed" in capsys.readouterr().err
     numbers = sorted(int(file.stem.split("-")[1]) for file in tmp_path.glob("match-*.json"))
     assert numbers == [21, 22, 23, 24, 25]
     assert {written(tmp_path, number)["result"]["reason"] for number in numbers} == {"TOO_FEW_POINTS"}
@@ -170,7 +170,7 @@ def test_failures_are_bounded(capsys: pytest.CaptureFixture[str]) -> None:
     wanted = [kept.wants(float(k), failed) for k in range(MOST_FAILED + 5)]
     assert sum(wanted) == MOST_FAILED
     assert kept.sentences()[1:] == [
-        f"{MOST_FAILED + 5} matches were no result; the first {MOST_FAILED} of them are in the journal"
+        f"{MOST_FAILED + 5} matches failed; the first {MOST_FAILED} of them are in the match trace"
     ]
 
 
@@ -180,7 +180,7 @@ def test_numbers_and_times_that_the_log_has_not_are_said(
     arguments = ["--journal", "2,900", "--journal-at", "77"]
     assert parser.main(["replay", str(log), "--out", str(tmp_path), *arguments]) == console.OK
     said = capsys.readouterr().err
-    assert f"no match 900: the log has {SCANS}" in said
+    assert f"no match 900; the log has {SCANS}" in said
     assert "no match at or after 77 s" in said
     assert (tmp_path / "match-2.json").exists()
     assert "matches written: 1\n" in said
@@ -188,7 +188,7 @@ def test_numbers_and_times_that_the_log_has_not_are_said(
     assert parser.main(["replay", str(log), "--out", str(tmp_path), "--journal", "99999"]) == console.FAILED
     said = capsys.readouterr().err
     assert "matches written: 0; files of an earlier run removed: 2" in said
-    assert "none of the matches asked for is in the log" in said
+    assert "the log has none of the requested matches" in said
     assert {file.name for file in tmp_path.glob("match*")} == {"match-notes.json"}
 
 
@@ -229,7 +229,7 @@ def test_without_matplotlib_the_data_is_written_and_the_pictures_are_missed(
 ) -> None:
     monkeypatch.setattr(match_plot, "find_spec", lambda name: None)
     assert parser.main(["replay", str(log), "--out", str(tmp_path), "--journal", "3"]) == console.OK
-    assert "no pictures of matches: matplotlib is not installed" in capsys.readouterr().err
+    assert "no plots of matches: matplotlib is not installed" in capsys.readouterr().err
     assert {file.name for file in tmp_path.glob("match*")} == {"match-3.json"}
 
 

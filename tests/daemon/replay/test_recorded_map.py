@@ -67,7 +67,7 @@ def test_a_replay_without_the_map_is_refused(
 ) -> None:
     (recording,) = (run[0] / "second").iterdir()
     good = (recording / START).read_bytes()
-    for content, why in ((good[:-1], "is not the map that the recorded run began with"), (None, "No such file")):
+    for content, why in ((good[:-1], "is not the map from the start of the recorded run"), (None, "No such file")):
         (recording / START).unlink()
         if content is not None:
             (recording / START).write_bytes(content)
@@ -96,14 +96,14 @@ def test_a_named_folder_without_a_map_is_refused_one_of_a_configuration_is_noted
     words = ["replay", str(run[0] / "first"), "--out", str(tmp_path / "out")]
     assert parser.main([*words, "--set", f"map.folder={empty}"]) == console.FAILED
     said = capsys.readouterr().err
-    assert f"{empty} holds no map that can be used (name another folder" in said
+    assert f"{empty} holds no usable map (name another folder" in said
     assert "--set map.folder=none" in said
     assert parser.main([*words, "--set", "map.folder=none"]) == console.OK
-    assert "holds no map" not in capsys.readouterr().err
+    assert "holds no usable map" not in capsys.readouterr().err
 
     source = open_log(run[0] / "first")
     assert start_for(source, Config(map=MapConfig(folder=str(empty))), None, Given(keys=("map.localise",))) is None
-    assert source.report.notes == [f"{empty} holds no map that can be used: replayed without one"]
+    assert source.report.notes == [f"{empty} holds no usable map; the replay runs without one"]
 
 
 def test_the_map_that_a_replay_writes_is_one_to_begin_with(
@@ -111,7 +111,7 @@ def test_the_map_that_a_replay_writes_is_one_to_begin_with(
 ) -> None:
     replay(run[0] / "first", tmp_path / "out")
     assert parser.main(["map", "verify", str(tmp_path / "out" / "map.lumimap")]) == console.OK
-    assert "good, map" in capsys.readouterr().out
+    assert "valid, map" in capsys.readouterr().out
     assert started(MapConfig(folder=str(tmp_path / "out")), None)[1] is not None
 
 

@@ -47,7 +47,7 @@ def test_an_unknown_method_is_refused(log: Path, tmp_path: Path, capsys: pytest.
         parser.main(["replay", str(log), "--out", str(tmp_path), "--method", "slam"])
     assert ended.value.code == parser.USAGE
     said = capsys.readouterr().err
-    assert "--method: there is no 'slam'" in said
+    assert "--method: 'slam' is unknown" in said
     assert all(name in said for name in METHODS)
     assert not list(tmp_path.iterdir())
 

@@ -34,10 +34,10 @@ GRID = Grid(np.array([-3.0, 7.5]), 0.05, LOGITS)
     ("states", "said"),
     [
         ([State.TRACKING, State.MAPPING], ""),
-        ([State.LOST, State.TRACKING], "1 of 2 poses are guesses, their place was not known (LOST 1)"),
+        ([State.LOST, State.TRACKING], "1 of 2 poses are unconfirmed (LOST 1)"),
         (
             [State.LOST, State.AMBIGUOUS, State.TRACKING, State.AMBIGUOUS],
-            "3 of 4 poses are guesses, their place was not known (AMBIGUOUS 2, LOST 1); the last one too (AMBIGUOUS)",
+            "3 of 4 poses are unconfirmed (AMBIGUOUS 2, LOST 1); the last one too (AMBIGUOUS)",
         ),
         ([], ""),
     ],
@@ -49,7 +49,7 @@ def test_guesses_are_counted_in_a_sentence(states: list[State], said: str) -> No
 
 @pytest.mark.parametrize(
     ("guesses", "said"),
-    [(0, ""), (10, ""), (11, "11 % of the poses are guesses"), (100, "100 % of the poses are guesses")],
+    [(0, ""), (10, ""), (11, "11 % of the poses are unconfirmed"), (100, "100 % of the poses are unconfirmed")],
 )
 def test_guesses_in_more_than_a_tenth_are_a_warning(guesses: int, said: str) -> None:
     states = np.repeat(np.array([State.RELOCATING, State.TRACKING], np.int64), [guesses, 100 - guesses])
@@ -274,7 +274,7 @@ def test_folder_problems_are_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputRefused, match=r"file is a file; name a folder"):
         Folder(tmp_path / "file")
-    with pytest.raises(OutputRefused, match="cannot make"):
+    with pytest.raises(OutputRefused, match="cannot create"):
         Folder(tmp_path / "file" / "below")
 
 
@@ -306,7 +306,7 @@ def test_what_has_room_is_written_though_something_else_has_none(
     folder = Folder(tmp_path)
     monkeypatch.setattr(Path, "write_bytes", nearly_full)
     files = [("big", bytes(101)), ("small", b"kept"), ("huge", bytes(999)), ("last", b"kept too")]
-    with pytest.raises(OutputRefused, match=r"big: No space left on device.*; nor could huge be written"):
+    with pytest.raises(OutputRefused, match=r"big: No space left on device.*; huge could not be written either"):
         folder.write_each(files)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["last", "small"]
 

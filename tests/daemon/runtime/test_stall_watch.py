@@ -92,12 +92,12 @@ def test_another_thread_that_works_meanwhile_is_named(watch: StallWatch) -> None
 def test_whose_fault_it_was() -> None:
     at = Caught("cycle.run > step", "cycle", "")
     assert "ran for 0.900 s" in cause(at, 1.0, 0.9, 0.0)
-    assert "other programs had the processor for 0.800 s" in cause(at, 1.0, 0.1, 0.8)
-    assert "a call that blocks" in cause(at, 1.0, 0.1, 0.1)
-    assert "a call that blocks" in cause(at, 1.0, 0.1, None)
+    assert "other programs used the processor for 0.800 s" in cause(at, 1.0, 0.1, 0.8)
+    assert "a call blocked, or the process was stopped" in cause(at, 1.0, 0.1, 0.1)
+    assert "a call blocked, or the process was stopped" in cause(at, 1.0, 0.1, None)
     assert "waited while x in y" in cause(Caught("cycle.run", "", "x in y"), 1.0, 0.1, 0.1)
-    assert "nothing was due" in cause(Caught("", "", ""), 1.0, 0.1, 0.1)
-    assert "nothing was due" in cause(Caught("", "", "x in y"), 1.0, 0.1, 0.1)
+    assert "no event arrived, neither a scan nor the timer" in cause(Caught("", "", ""), 1.0, 0.1, 0.1)
+    assert "no event arrived, neither a scan nor the timer" in cause(Caught("", "", "x in y"), 1.0, 0.1, 0.1)
     assert "the loop waited while x in y" in cause(Caught("", "", "x in y", late=0.5), 1.0, 0.1, 0.1)
     assert "the process was stopped" in cause(Caught("", "", "", late=0.5), 1.0, 0.1, 0.1)
 

@@ -161,7 +161,7 @@ def test_a_start_of_which_one_kernel_is_missing_waits_before_it_compiles_it(tmp_
         assert not missing.exists()
     output, said = second.communicate(timeout=120.0)
     assert output == "True\n", said
-    assert "waiting for another process, which compiles kernels" in said
+    assert "waiting for another process that compiles" in said
     assert missing.exists()
 
 
@@ -175,7 +175,7 @@ def test_a_first_start_waits_for_another_and_says_so(
         with another_compiles(tmp_path):
             loading = pool.submit(warmup.load)
             assert waits.wait(10.0)
-            assert warmup._progress_line(12.0) == "waiting for another process, which compiles kernels, after 12 s"
+            assert warmup._progress_line(12.0) == "waiting for another process that compiles kernels, after 12 s"
             (tmp_path / "one.nbc").touch()
             warmup.mark_of("warm").touch()  # it has compiled all of them
             assert not loading.done()
@@ -232,7 +232,7 @@ def test_the_first_start_ever_says_that_it_compiles_and_how_long(tmp_path: Path)
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
         texts.append(done.stdout + done.stderr)
     assert "compiled=True" in texts[0]
-    assert f"compiling its {kernel_count()} kernels" in texts[0]
+    assert f"the daemon compiles up to {kernel_count()} kernels" in texts[0]
     assert "kernels compiled in" in texts[0]
     assert "compiled=False" in texts[1]
     assert "compil" not in texts[1].replace("compiled=False", "")
@@ -279,7 +279,7 @@ def test_a_command_says_once_that_it_compiles(tmp_path: Path, monkeypatch: pytes
 
     for _ in range(2):
         warmup.load_aloud(say, "warm", work)
-    assert said[0].startswith("first start of this version: its kernels are being compiled")
+    assert said[0].startswith("first start of this version: the daemon compiles its kernels")
     assert said[1].startswith("1 kernels compiled in 0 s")
     assert len(said) == 2
 
@@ -322,7 +322,7 @@ def test_a_lock_of_another_user_is_named_with_its_remedy(monkeypatch: pytest.Mon
         raise PermissionError(13, "Permission denied", "/var/cache/lumiloop/lock")
 
     monkeypatch.setattr(warmup, "_load", refused)
-    with pytest.raises(warmup.CannotLoad, match=r"/var/cache/lumiloop/lock.*give that file to the user"):
+    with pytest.raises(warmup.CannotLoad, match=r"/var/cache/lumiloop/lock.*give this user write access to that file"):
         warmup.load()
 
 
@@ -336,7 +336,7 @@ def test_warm_loads_what_an_earlier_start_has_compiled() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"
-    assert done.stderr.startswith("lumiloop: an earlier start has compiled the kernels; they load in ")
+    assert done.stderr.startswith("lumiloop: the kernels were compiled before; they load in ")
 
 
 def test_a_mark_without_kernels_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

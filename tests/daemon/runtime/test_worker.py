@@ -75,7 +75,7 @@ def test_a_recording_decides_in_which_cycle_an_answer_is_applied() -> None:
 
 
 def test_an_answer_to_a_job_that_was_never_asked_for_is_refused() -> None:
-    with pytest.raises(LookupError, match="cycle 1: job 5 was never asked for"):
+    with pytest.raises(LookupError, match="cycle 1: job 5 was never requested"):
         ScheduledWorker({1: (5,)}).collect(0.0)
 
 

@@ -207,7 +207,7 @@ def test_a_survey_is_read_for_the_configured_profile(tmp_path: Path) -> None:
     assert lights is not None
     assert lights.survey.depth == PROFILE_B.depth
     assert load(512, "D") is not None
-    with pytest.raises(SurveyError, match=r"lamp 1: code 65 is none of profile B, which has codes 0 to 64"):
+    with pytest.raises(SurveyError, match=r"lamp 1: code 65 is not in profile B, which has codes 0 to 64"):
         load(65, "B")
 
 

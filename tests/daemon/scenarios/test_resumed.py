@@ -116,7 +116,7 @@ def test_where_it_was_left_it_is_tracked_at_once(
     tracked = next(s for s in bench.snapshots if s.state is State.TRACKING)
     assert tracked.t_sent - first.t_sent < 2.0
     assert not set(wrong(bench, at, begin)) & {State.TRACKING, State.DEGRADED}
-    assert sum("the robot was last at" in record.message for record in caplog.records) == 1
+    assert sum("the last stored pose is x" in record.message for record in caplog.records) == 1
 
 
 MOVED = {

@@ -29,7 +29,7 @@ def test_a_command_under_a_memory_limit_names_it(megabytes: int) -> None:
     )  # fmt: skip
     assert done.returncode == 1
     assert done.stderr.startswith("lumiloop: not enough memory")
-    assert "raise MemoryMax=" in done.stderr
+    assert "raise `MemoryMax=`" in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -45,7 +45,7 @@ def test_a_client_that_provokes_an_error_all_the_time_cannot_fill_the_log() -> N
         log.fail(ValueError(f"request {request} is damaged"))
     assert log.text.count("Traceback") == 1
     assert log.text.count("a request failed") <= 100.0 / EVERY_S + 1
-    assert "a request failed: ValueError: request 1000 is damaged (999 more such lines were left out" in log.text
+    assert "a request failed: ValueError: request 1000 is damaged (999 more such lines were skipped" in log.text
 
 
 def test_errors_of_other_kinds_and_places_have_their_own_traceback() -> None:

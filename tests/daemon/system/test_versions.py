@@ -24,7 +24,7 @@ def test_another_build_is_named_with_all_that_differs_and_nothing_else() -> None
     said = versions.made_elsewhere({"versions": told})
     here = f"lumiloop {HERE['lumiloop']}, build {HERE['build']}, numpy {HERE['numpy']}"
     theirs = "lumiloop 0.0.7, build of last year, numpy 1.0"
-    assert said == f"recorded with {theirs}; this is {here}: the replay may differ from what ran then"
+    assert said == f"recorded with {theirs}; this is {here}, so the replay may differ from the recorded run"
 
 
 def test_what_a_recording_says_of_itself_gives_a_terminal_no_orders() -> None:

@@ -160,9 +160,9 @@ def test_the_image_is_one_map_that_a_robot_can_start_in_and_that_draws_itself() 
 
 
 def test_without_walls_or_room_there_is_nothing_to_be_localised_in() -> None:
-    with pytest.raises(ValueError, match="no free place beside a wall"):
+    with pytest.raises(ValueError, match="the map has no free position beside a wall, so"):
         image_of_cells(np.zeros((40, 40), np.int8), 0.05, np.zeros(3), WHO)
-    with pytest.raises(ValueError, match="no free place beside a wall"):
+    with pytest.raises(ValueError, match="the map has no free position beside a wall, so"):
         image_of_cells(np.ones((40, 40), np.int8), 0.05, np.zeros(3), WHO)
 
 

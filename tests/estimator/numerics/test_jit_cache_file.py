@@ -47,7 +47,7 @@ DAMAGES: dict[str, Callable[[Path], None]] = {
     "one byte": replaced(lambda data: data[:1]),
     "half": replaced(lambda data: data[: len(data) // 2]),
     "all but one": replaced(lambda data: data[:-1]),
-    "lengthened": replaced(lambda data: data + b"\0"),
+    "bytes long instead of": replaced(lambda data: data + b"\0"),
     "zeros": replaced(lambda data: bytes(len(data))),
     "second half zeros": replaced(lambda data: data[: len(data) // 2] + bytes(len(data) - len(data) // 2)),
     "first bit": replaced(lambda data: bit_flipped(data, 0)),

@@ -40,7 +40,7 @@ def test_names_choose_the_kind() -> None:
         ((read(0x4D, 0),), "0 bytes"),
         ((write(0x4D, b""),), "0 bytes"),
         ((read(0x80, 2),), "0x80"),
-        ((Message(0x4D, b"x", 2),), "either writes or reads"),
+        ((Message(0x4D, b"x", 2),), "a message must either write or read"),
     ],
 )
 def test_what_no_kernel_takes(messages: tuple[Message, ...], says: str) -> None:

@@ -35,7 +35,7 @@ def test_done() -> None:
 
 @pytest.mark.parametrize(
     ("error", "noun"),
-    [(DeviceMissing("a", "gone", "plug it in"), 1), (DeviceRefused("a", "busy"), 2), (DeviceFault("a", "stuck"), 3)],
+    [(DeviceMissing("a", "gone", "connect it"), 1), (DeviceRefused("a", "busy"), 2), (DeviceFault("a", "stuck"), 3)],
 )
 def test_refused(error: HalError, noun: int) -> None:
     raw = frames.refused(error)
@@ -58,7 +58,7 @@ def test_frames_are_cut_out_of_any_pieces(piece: int) -> None:
 
 @pytest.mark.parametrize("length", [0, frames.MAX_FRAME + 1, 0xFFFFFFFF])
 def test_a_length_that_cannot_be(length: int) -> None:
-    with pytest.raises(frames.BadFrame, match="a frame of"):
+    with pytest.raises(frames.BadFrame, match="a message of"):
         frames.Splitter().feed(length.to_bytes(4, "big") + b"\x03")
 
 
@@ -86,9 +86,9 @@ def test_an_answer_that_is_cut(cut: int) -> None:
     ("body", "says"),
     [
         (HELLO[5:] + b"x", "too long"),
-        (b"\x00" + HELLO[6:], "no I2C bus server"),
+        (b"\x00" + HELLO[6:], "this is not an I2C bus server"),
         (HELLO[5:9] + b"\x02" + HELLO[10:], "version 2"),
-        (HELLO[5:10] + bytes.fromhex("7ff8000000000000") + HELLO[18:], "times that cannot be"),
+        (HELLO[5:10] + bytes.fromhex("7ff8000000000000") + HELLO[18:], "impossible times"),
         (HELLO[5:-3] + b"\xff\xfe\xfd", "UTF-8"),
     ],
 )

@@ -131,7 +131,7 @@ async def test_the_driver_survives_its_server(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("behave", "kind", "says"),
     [
-        (lambda link: None, DeviceFault, "no greeting: the bus server has closed"),
+        (lambda link: None, DeviceFault, "no hello message: the bus server has closed"),
         (lambda link: link.sendall(b"SSH-2.0-OpenSSH_9.2\r\n"), DeviceRefused, "not an I2C bus server"),
         (lambda link: link.sendall(b"\x00\x00\x00\x01\x07"), DeviceRefused, "not an I2C bus server"),
         (lambda link: link.sendall(frames.hello(0.0, "a", "b")[:-1] + b"\xff"), DeviceRefused, "UTF-8"),
@@ -250,7 +250,7 @@ def test_what_is_no_address(name: str) -> None:
 
 
 def test_why_there_is_no_connection(tmp_path: Path) -> None:
-    with pytest.raises(DeviceMissing, match=r"no bus server there .start the bus server"):
+    with pytest.raises(DeviceMissing, match=r"no bus server runs there .start the bus server"):
         open_remote(f"unix:{tmp_path}/none")
     with pytest.raises(DeviceMissing, match="host name is not known"):
         open_remote("tcp://no-such-host.invalid:1")
@@ -258,7 +258,7 @@ def test_why_there_is_no_connection(tmp_path: Path) -> None:
         open_remote("tcp://robot..local:1")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    with pytest.raises(DeviceMissing, match="no bus server there"):
+    with pytest.raises(DeviceMissing, match="no bus server runs there"):
         open_remote(f"tcp://127.0.0.1:{port}")
     datagrams = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     datagrams.bind(str(tmp_path / "d"))

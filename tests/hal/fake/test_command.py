@@ -32,7 +32,7 @@ def test_command_serves_takes_orders_and_ends(tmp_path: Path) -> None:
         assert [process.stdout.readline() for _ in range(3)] == [
             f"1 faults of {faults} ordered\n",
             f"UTM-30LX on {link}\n",
-            f"fault orders on {control}\n",
+            f"fault commands on {control}\n",
         ]
 
         async def talk() -> None:
@@ -65,7 +65,7 @@ def test_command_serves_takes_orders_and_ends(tmp_path: Path) -> None:
         (["--tcp", "127.0.0.1"], "expected HOST:PORT"),
         (["--tcp", "127.0.0.1:70000"], "expected HOST:PORT"),
         (["--tcp", ":10940"], "expected HOST:PORT"),
-        (["--faults", "pyproject.toml"], "build-system: a schedule holds [[fault]] tables"),
+        (["--faults", "pyproject.toml"], "build-system: a schedule must have only [[fault]] tables"),
         (["--model", "LMS"], "invalid choice: 'LMS'"),
     ],
 )

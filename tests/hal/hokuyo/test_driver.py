@@ -64,7 +64,7 @@ class TestFindingTheSensor:
             driver = bench.driver(serial="H7")
             async with bench.running(driver):
                 await asyncio.sleep(1.0)
-                assert str(error_of(driver)).startswith("auto: no HOKUYO H7 found (plug the sensor in")
+                assert str(error_of(driver)).startswith("auto: no HOKUYO H7 was found (connect the sensor")
 
         on_fake(body)
 
@@ -82,7 +82,7 @@ class TestFindingTheSensor:
 
     def test_impossible_rate(self) -> None:
         async def body(bench: Bench) -> None:
-            with pytest.raises(ValueError, match="baud 9600: SCIP knows 19200"):
+            with pytest.raises(ValueError, match="line rate 9600: SCIP has 19200"):
                 bench.driver(baud=9600)
 
         on_fake(body)
@@ -124,8 +124,8 @@ class TestWaiting:
         [
             DeviceRefused(PORT, "permission denied", "add the user to group dialout and log in again"),
             DeviceRefused(PORT, "in use by another program", f"find it with: fuser -v {PORT}"),
-            DeviceRefused(PORT, "not a serial port", "name the sensor's own device file"),
-            DeviceMissing(PORT, "no such device", "plug the sensor in"),
+            DeviceRefused(PORT, "not a serial port", "name the device file of the sensor, such as"),
+            DeviceMissing(PORT, "no such device", "connect the sensor"),
         ],
         ids=str,
     )

@@ -89,7 +89,7 @@ class TestIntensity:
             bench.fake.receive = weak  # type: ignore[method-assign]  # a weak sensor
             driver = bench.driver(intensity=True)
             await bench.deliver(driver, 30, within=40.0)
-            assert driver.status.extra["intensity"] == "off: given up after failures"
+            assert driver.status.extra["intensity"] == "off: stopped after failures"
             assert driver.status.dialect == "SCIP 2.2 MD"
 
         on_fake(body, UST_10LX)

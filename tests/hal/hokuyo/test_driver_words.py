@@ -38,7 +38,7 @@ class TestWords:
             '[[fault]]\nwhat = "status"\ncode = 60\nfor = 20.0\nwhen = 3.0',
             '[[fault]]\nwhat = "no_reply"\ncommand = "VV"\nfor = 20.0',
         ],
-        ids=["fine", "no scans", "mute", "garbage", "hardware trouble", "VV lost"],
+        ids=["fine", "no scans", "mute", "garbage", "hardware fault", "VV lost"],
     )
     def test_old_firmware_hears_only_what_it_can_digest(self, name: str, faults: str) -> None:
         """Anything else has been seen to wedge it until a power cycle."""

@@ -49,8 +49,8 @@ def test_who_is_where() -> None:
     assert b.geometry is not None
     assert (b.geometry.serial, b.baud) == ("H2", 115200)
     assert isinstance(c.error, DeviceFault)
-    assert "nothing answers" in str(c)
-    assert str(Finding("/dev/x")) == "/dev/x: nothing known"
+    assert "no reply" in str(c)
+    assert str(Finding("/dev/x")) == "/dev/x: no data"
     assert isinstance(d.error, DeviceMissing)
 
 
@@ -68,8 +68,8 @@ def test_a_server_of_something_else_that_hangs_up_is_shown_by_its_first_words() 
         return await identify_at(serves, "tcp://ssh:22"), await identify_at(serves, "tcp://mute:22")
 
     banner, mute = run_virtual(body())
-    assert "only unreadable bytes come" in str(banner)
-    assert "'SSH-2.0-OpenSSH_9.2p': name the lidar's own address and port" in str(banner)
+    assert "only unreadable bytes arrive" in str(banner)
+    assert "'SSH-2.0-OpenSSH_9.2p': name the address and port of the lidar" in str(banner)
     assert isinstance(mute.error, DeviceMissing)
 
 

@@ -99,11 +99,11 @@ class TestSettle:
         assert script.received == ["QT"]
 
     def test_mute(self) -> None:
-        with pytest.raises(DeviceFault, match=r"/dev/x: nothing answers .*HOKUYO"):
+        with pytest.raises(DeviceFault, match=r"/dev/x: no reply .*HOKUYO"):
             self.run(Scripted())
 
     def test_noise(self) -> None:
-        with pytest.raises(DeviceFault, match="only unreadable bytes come"):
+        with pytest.raises(DeviceFault, match="only unreadable bytes arrive"):
             self.run(Scripted(QT=[b"\x80" * 300]))
 
     @pytest.mark.parametrize(
@@ -116,9 +116,9 @@ class TestSettle:
         ids=["NMEA", "echo", "half of it no letters"],
     )
     def test_what_talks_and_is_no_lidar_is_shown(self, said: bytes, shown: str) -> None:
-        with pytest.raises(DeviceFault, match=f"only unreadable bytes come .*not SCIP, {shown}") as told:
+        with pytest.raises(DeviceFault, match=f"only unreadable bytes arrive .*does not use SCIP, {shown}") as told:
             self.run(Scripted(QT=[said]))
-        assert told.value.problem == "only unreadable bytes come", "it is logged once for this text"
+        assert told.value.problem == "only unreadable bytes arrive", "it is logged once for this text"
 
     def test_abnormal(self) -> None:
         with pytest.raises(AbnormalState, match=r"0L.*power off and on"):
@@ -254,7 +254,7 @@ class TestIdentify:
 
     def test_no_lidar(self) -> None:
         script = Scripted(VV=GOOD["VV"], PP=[encoder.text("PP", [("MODL", "Coffee machine")])])
-        with pytest.raises(DeviceRefused, match="PP says DMIN='', expected a number"):
+        with pytest.raises(DeviceRefused, match="PP reply has DMIN='', expected a number"):
             with_session(script, lambda session: session.identify())  # type: ignore[arg-type, return-value]  # raises
 
 
@@ -279,7 +279,7 @@ class TestRate:
         with_session(Scripted(SS=[status]), body, baud=19200)
 
     def test_lost_on_the_way(self) -> None:
-        with pytest.raises(DeviceFault, match="lost after changing to 250000"):
+        with pytest.raises(DeviceFault, match="lost after the change to 250000"):
             with_session(Scripted(SS=[OK]), lambda session: session.set_rate(250000), baud=19200)
 
     def test_an_adapter_that_cannot_do_it_is_found_out_before_the_sensor_changes(self) -> None:
@@ -318,7 +318,7 @@ class TestRate:
 
     def test_no_rate(self) -> None:
         script = Scripted()
-        with pytest.raises(DeviceFault, match="nothing answers at any line rate"):
+        with pytest.raises(DeviceFault, match="no reply at any line rate"):
             with_session(script, lambda session: session.find_rate(250000))
         assert script.bauds == [250000, 19200, 38400, 57600, 115200, 500000, 750000]
 
@@ -326,9 +326,7 @@ class TestRate:
         """At all rates but its own it is no text."""
         noise = b"\x80\xf8\x00" * 10
         script = Scripted(QT=[None, noise, b"$GPRMC,1235\r\n", noise])
-        with pytest.raises(
-            DeviceFault, match=r"only unreadable bytes come .*'\$GPRMC,1235': name the lidar's own port"
-        ):
+        with pytest.raises(DeviceFault, match=r"only unreadable bytes arrive .*'\$GPRMC,1235': name the lidar's port"):
             with_session(script, lambda session: session.find_rate())
 
 
@@ -364,11 +362,11 @@ class TestStart:
     @pytest.mark.parametrize(
         ("status", "kind", "words"),
         [
-            ("04", DeviceRefused, "does not accept the range"),
+            ("04", DeviceRefused, "the sensor rejects the range that it states"),
             ("10", DeviceFault, "not now"),
             ("0L", AbnormalState, "error state"),
-            ("60", DeviceFault, "hardware trouble"),
-            ("30", DeviceFault, "checking itself"),
+            ("60", DeviceFault, "hardware fault"),
+            ("30", DeviceFault, "the sensor runs a self-test"),
             ("0A", DeviceFault, "MD answers 0A"),
         ],
     )

@@ -87,8 +87,8 @@ def test_every_damaged_bit_is_noticed() -> None:
         (lambda d: d[:20], "too short"),
         (lambda d: b"XXXX" + d[4:], "unknown magic"),
         (lambda d: d[:4] + b"\x02\x00" + d[6:], "version 2"),
-        (lambda d: d + b"\x00", "says 60 bytes and has 61"),
-        (lambda d: b"LUIM" + d[4:], "says 60 bytes"),
+        (lambda d: d + b"\x00", "its length field is 60, but it has 61 bytes"),
+        (lambda d: b"LUIM" + d[4:], "its length field is 60"),
         (lambda d: d[:-1] + bytes([d[-1] ^ 1]), "CRC-32"),
         (lambda d: datagram(1, (math.nan, 0.0, 0.0)), "not finite"),
         (lambda d: datagram(1, (0.0, math.inf, 0.0)), "not finite"),
@@ -196,9 +196,12 @@ def test_a_second_sender_and_what_is_no_reading_are_said_once_while_they_last(ca
     rival, damaged = datagram(1, session=2), datagram(1)[:-1]
     assert both(0.8, rival) == both(0.8, damaged) == [], "a quick restart, some damage: no line of the log"
     assert both(3.0, rival) == [
-        "port 0: readings of a sender are ignored while another sender is heard there (end one of them)"
+        "port 0: readings from a sender are ignored while another sender is active (end one of them)"
     ]
-    assert both(3.0, damaged) == ["port 0: what a sender sends is no reading: input datagram: says 60 bytes and has 59"]
+    assert both(3.0, damaged) == [
+        "port 0: a datagram from a sender is not a valid reading: "
+        "input datagram: its length field is 60, but it has 59 bytes"
+    ]
     assert both(3.0, rival) == both(3.0, damaged) == []
     listening.t += ABSENT_S
     assert len(both(3.0, rival)) == len(both(3.0, damaged)) == 1, "on another day it is news"

@@ -79,7 +79,8 @@ def test_an_adapter_with_a_limit() -> None:
 
 def test_what_cannot_read_a_block_at_all() -> None:
     with pytest.raises(
-        DeviceRefused, match=r"in one go .60 bytes: Operation not.*end what else reads on this bus.*controller of the"
+        DeviceRefused,
+        match=r"at once .60 bytes: Operation not.*without any, use an I2C controller of the",
     ):
         measured(Adapter("tiny", max_read=32))
 

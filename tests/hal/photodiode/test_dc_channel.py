@@ -56,7 +56,7 @@ def test_light_without_lamps_is_neither_dark_nor_dead() -> None:
         driver = bench.driver(DC)
         async with bench.running(driver):
             await bench.more(60, 10.0, driver)
-            assert "there is light, but no lamp in it" in str(driver.status.error)
+            assert "there is light, but no modulated light" in str(driver.status.error)
             assert driver.status.recoveries == 0
 
     on_fake(body)
@@ -67,8 +67,8 @@ def test_light_without_lamps_is_neither_dark_nor_dead() -> None:
     ("fault", "says"),
     [
         ("dark", "dark: no light reaches the photodiode .*cover"),
-        ("saturated", "dazzled: the amplifier is saturated .*shade"),
-        ("stuck", "though there is light: the converter or its input is dead .*wire"),
+        ("saturated", "saturated: there is too much light for the amplifier .*shade"),
+        ("stuck", "the converter or its input is defective .*wire"),
     ],
 )
 def test_causes_are_told_apart(fault: str, says: str, late: float) -> None:
@@ -115,7 +115,7 @@ def test_a_dead_converter_is_started_afresh_now_and_then(caplog: pytest.LogCaptu
             bench.order("what = 'stuck'")
             await asyncio.sleep(100.0)
             assert 3 <= driver.status.recoveries <= 4
-            assert "dead converter" in str(driver.status.error)
+            assert "defective converter" in str(driver.status.error)
 
     with caplog.at_level(logging.INFO, "hal"):
         on_fake(body)
@@ -183,7 +183,7 @@ def test_another_program_on_the_chip_is_noticed_and_its_input_is_no_level(
                 await asyncio.sleep(0.03)
                 seen.add(driver.status.extra["dc_level"])
             assert not [said for said in seen if said.split()[0] not in ("40.0", "another")], seen
-            assert any("another program changes the chip's configuration" in said for said in seen)
+            assert any("another program changes the configuration of the" in said for said in seen)
             bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
             await asyncio.sleep(15.0)
             assert driver.status.extra["dc_level"] == "40.0 %"
@@ -193,7 +193,7 @@ def test_another_program_on_the_chip_is_noticed_and_its_input_is_no_level(
         on_fake(body)
     told = [record.getMessage() for record in caplog.records]
     assert len(told) == 1, told
-    assert "another program changes the chip's configuration" in told[0]
+    assert "another program changes the configuration of the" in told[0]
 
 
 @pytest.mark.parametrize("wrong", ["LM75", "24C02"])

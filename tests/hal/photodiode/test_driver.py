@@ -111,7 +111,12 @@ def test_first_word_after_a_pause_is_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("adapter", "samples", "why"),
-    [(FT260, 30, "60 bytes"), (CP2112, 30, "61 bytes"), (CH341, 30, "32 bytes"), (I2C_GPIO, 278, "bit by bit")],
+    [
+        (FT260, 30, "60 bytes"),
+        (CP2112, 30, "61 bytes"),
+        (CH341, 30, "32 bytes"),
+        (I2C_GPIO, 278, "the processor clocks this bus in software, with"),
+    ],
     ids=["FT260", "CP2112", "CH341", "i2c-gpio"],
 )
 def test_adapters_that_pause_are_named(
@@ -125,7 +130,11 @@ def test_adapters_that_pause_are_named(
         assert abs(blocks[-1].words.size - samples) <= 4
 
     on_fake(body, adapter=adapter)
-    assert [why in one.getMessage() for one in caplog.records if "not fit for decoding" in one.getMessage()] == [True]
+    assert [
+        why in one.getMessage()
+        for one in caplog.records
+        if "samples cannot be used to decode lamps" in one.getMessage()
+    ] == [True]
 
 
 def test_nothing_is_said_of_an_adapter_that_does_not_pause(caplog: pytest.LogCaptureFixture) -> None:
@@ -143,7 +152,7 @@ def test_an_adapter_that_cannot_read_blocks_is_refused() -> None:
         driver = bench.driver()
         async with bench.running(driver):
             await asyncio.sleep(3.0)
-            assert "cannot read 60 bytes in one go" in str(driver.status.error)
+            assert "cannot read 60 bytes at once" in str(driver.status.error)
         assert not bench.blocks
 
     on_fake(body, adapter=Adapter("SMBus thing", max_read=32))
@@ -172,10 +181,10 @@ def test_scl_beyond_the_data_sheet_is_told() -> None:
 @pytest.mark.parametrize(
     ("chip", "address", "block_s", "says"),
     [
-        ("MCP3421", 0x68, 0.05, "known are mcp3221"),
+        ("MCP3421", 0x68, 0.05, "supported are mcp3221"),
         ("ADS1115", 0x48, 0.05, "levels only"),
-        ("MCP3221", 0x54, 0.05, "answers at one of 0x48, 0x49"),
-        ("ADC121C021", 0x4D, 0.05, "answers at one of 0x50"),
+        ("MCP3221", 0x54, 0.05, "has one of the addresses 0x48, 0x49"),
+        ("ADC121C021", 0x4D, 0.05, "has one of the addresses 0x50"),
         ("mcp3221", 0x4D, 0.0, "0.001 to 1 s"),
         ("mcp3221", 0x4D, float("nan"), "0.001 to 1 s"),
     ],
@@ -204,7 +213,7 @@ def test_an_open_that_hangs_is_told() -> None:
         driver = bench.driver()
         async with bench.running(driver):
             await asyncio.sleep(3.1)
-            assert "has been opening for 3 s" in str(driver.status.error)
+            assert "opening the bus has taken 3 s" in str(driver.status.error)
             assert driver.status.link is Link.WAITING
             await bench.more(3, 20.0, driver)
             assert driver.status.error is None
@@ -267,7 +276,7 @@ def test_lost_clocks_are_told_where_the_light_is_low(bits: int) -> None:
             for _ in range(100):
                 await asyncio.sleep(0.01)
                 seen.add(str(driver.status.error))
-            assert any("words without their highest bits (another kind of chip, or bits lost" in said for said in seen)
+            assert any("words without their highest bits (check converter type" in said for said in seen)
             bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
             await bench.more(20, 10.0, driver)
             assert driver.status.error is None

@@ -54,7 +54,7 @@ def test_converters_are_named_and_told_from_others(adapter: Adapter) -> None:
         (0x54, "ADC121C021", True),
     ]
     assert str(finding).startswith(f"x: {adapter.name}\n  0x48: ADS1015 or ADS1115 (levels only")
-    assert "\n  0x49: something that is none of the converters" in str(finding)
+    assert "\n  0x49: an unsupported device" in str(finding)
 
 
 @pytest.mark.virtual
@@ -109,7 +109,7 @@ def test_through_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     linux.claimed = {0x48}
     (finding,) = asyncio.run(probe_buses(open_bus, ["/dev/i2c-1"]))
     assert [str(chip) for chip in finding.chips] == [
-        "0x48: in use by another program, or by a kernel driver; end or unbind it to look",
+        "0x48: in use by another program or a kernel driver; end or unbind it first",
         "0x4d: MCP3221",
     ]
     assert linux.closed == 1

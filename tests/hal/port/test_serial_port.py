@@ -123,10 +123,10 @@ async def test_open_errors_name_thing_and_remedy(tmp_path: Path) -> None:
     ("name", "loaded", "says"),
     [
         ("ttyACM7", "", "; its kernel module is not loaded: modprobe cdc_acm)"),
-        ("ttyACM7", "cdc_acm", "look for it with: lumiloop probe)"),
+        ("ttyACM7", "cdc_acm", "find it with: lumiloop probe)"),
         ("ttyUSB7", "cdc_acm", "; its kernel module is not loaded: modprobe ftdi_sio or cp210x or ch341 or pl2303)"),
-        ("ttyUSB7", "ch341", "look for it with: lumiloop probe)"),
-        ("lidar", "", "look for it with: lumiloop probe)"),
+        ("ttyUSB7", "ch341", "find it with: lumiloop probe)"),
+        ("lidar", "", "find it with: lumiloop probe)"),
     ],
 )
 def test_a_device_file_that_no_loaded_module_makes_is_said_to_lack_it(
@@ -140,10 +140,10 @@ def test_a_device_file_that_no_loaded_module_makes_is_said_to_lack_it(
 
 
 async def test_impossible_rate_is_refused(pty: Pty) -> None:
-    with pytest.raises(DeviceRefused, match="cannot do -5 bit/s"):
+    with pytest.raises(DeviceRefused, match="does not support -5 bit/s"):
         await open_port(pty.path, -5)
     port = await open_port(pty.path, 19200)
-    with pytest.raises(DeviceRefused, match="cannot do -5 bit/s"):
+    with pytest.raises(DeviceRefused, match="does not support -5 bit/s"):
         port.set_baud(-5)
     port.close()
 
@@ -152,11 +152,11 @@ async def test_impossible_rate_is_refused(pty: Pty) -> None:
     ("number", "kind", "words"),
     [
         (errno.EACCES, DeviceRefused, "group dialout"),
-        (errno.EPERM, DeviceRefused, "not permitted (the service's unit allows no such device"),
+        (errno.EPERM, DeviceRefused, "not permitted (the service unit denies this device"),
         (errno.EBUSY, DeviceRefused, "in use by another program"),
         (errno.EAGAIN, DeviceRefused, "in use by another program"),
-        (errno.ENODEV, DeviceMissing, "plug the sensor in"),
-        (errno.EIO, DeviceMissing, "plug the sensor in"),
+        (errno.ENODEV, DeviceMissing, "connect the sensor"),
+        (errno.EIO, DeviceMissing, "connect the sensor"),
         (errno.ENOTTY, DeviceRefused, "not a serial port"),
         (errno.EMFILE, DeviceRefused, "dmesg"),
     ],
@@ -178,7 +178,7 @@ def test_a_line_that_does_not_take_a_character_format_is_named_with_it() -> None
     wrapped = serial.SerialException("Could not configure port: (22, 'Invalid argument')")
     wrapped.__context__ = termios.error(errno.EINVAL, "Invalid argument")
     error = explain_open_error("/dev/null", 19200, wrapped, "8E1")
-    assert "does not take the character format 8E1" in str(error)
+    assert "does not support the character format 8E1" in str(error)
     assert "8N1" in error.remedy
     assert "not a serial port" in str(explain_open_error("/dev/null", 19200, wrapped, "8N1"))
 

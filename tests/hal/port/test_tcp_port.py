@@ -72,7 +72,7 @@ async def test_no_answer_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(asyncio.get_running_loop(), "create_connection", never)
     monkeypatch.setattr("hal.port.tcp_port.CONNECT_TIMEOUT_S", 0.02)
-    with pytest.raises(DeviceMissing, match=r"no answer .* at port 10940, as the name has none .*cable"):
+    with pytest.raises(DeviceMissing, match=r"no answer .* at port 10940, the default port .*cable"):
         await open_port("tcp://127.0.0.1", 0)
 
 
@@ -106,7 +106,7 @@ def test_bad_names(name: str) -> None:
         (
             OSError(errno.ECONNREFUSED, "Connect call failed"),
             DeviceRefused,
-            "refused at port 10940, as the name has none",
+            "refused at port 10940, the default port",
         ),
     ],
 )

@@ -51,7 +51,7 @@ def test_bytes_that_are_no_record_end_it(tmp_path: Path) -> None:
     path.write_bytes(pack(CHUNKS) + b"FLASER 180 1.0 1.0")
     report = LogReport()
     assert read_capture(path, report) == CHUNKS
-    assert "no record" in report.sentences()[0]
+    assert "not a record" in report.sentences()[0]
 
 
 @pytest.mark.parametrize("content", [b"", b"FLASER 180 1.0 1.0 1.0", b"\x1f\x8b\x08 gzip data here", b"\0" * 40])

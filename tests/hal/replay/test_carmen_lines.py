@@ -75,15 +75,15 @@ def test_lines_without_use(line: bytes) -> None:
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        (FLASER[:-12], "fields where"),
+        (FLASER[:-12], "fields instead of"),
         (FLASER.replace(b"2.50", b"2.5x"), "could not convert"),
         (FLASER.replace(b"FLASER 3", b"FLASER 0"), "0 beams"),
         (FLASER.replace(b"FLASER 3", b"FLASER -3"), "-3 beams"),
         (FLASER.replace(b"FLASER 3", b"FLASER 999999"), "999999 beams"),
         (FLASER.replace(b"976052857.337530", b"nan"), "time stamp"),
-        (FLASER + b" " + FLASER, "fields where"),  # two lines run together
+        (FLASER + b" " + FLASER, "fields instead of"),  # two lines run together
         (b"FLASER", "missing"),
-        (b"ODOM 1 2 3", "fields where"),
+        (b"ODOM 1 2 3", "fields instead of"),
         (b"ODOM nan 2 3 0 0 0 1 h 1", "not a number"),
         (b"PARAM", "missing"),
         (b"ROBOTLASER1 4 -1.5 3.1", "missing"),

@@ -65,7 +65,7 @@ def test_written_and_read(tmp_path: Path) -> None:
     assert not report.sentences()
     alone, report = read(tmp_path / segment_name(1))
     assert alone == FRAMES[12:]
-    assert report.sentences() == ["000001.lumirec: the segment before it is missing"]
+    assert report.sentences() == ["000001.lumirec: the previous segment is missing"]
 
 
 def test_the_format_is_what_its_description_says() -> None:
@@ -125,8 +125,8 @@ def test_segments_that_do_not_belong_together(tmp_path: Path) -> None:
     assert frames == FRAMES[:4]
     said = " ".join(report.sentences())
     assert "000001.lumirec: the head is damaged" in said
-    assert "000002.lumirec: the segment before it is missing" in said
-    assert "000003.lumirec: belongs to another recording" in said
+    assert "000002.lumirec: the previous segment is missing" in said
+    assert "000003.lumirec: the segment belongs to another recording" in said
 
 
 def test_several_recordings_in_one_folder_must_be_named(tmp_path: Path) -> None:

@@ -228,7 +228,7 @@ def test_a_router_that_dies_is_said_and_all_go_on_when_it_is_back(
         made.end()
         await until(lambda: not member.publishers)
         assert not member.localised
-        await until(lambda: heard("has gone; waiting for it", 2))
+        await until(lambda: heard("is lost; waiting for it", 2))
         old = member.pose
         await asyncio.sleep(0.5)
         assert member.pose is old
@@ -317,7 +317,7 @@ def test_the_command_shows_all_robots_on_one_map(tmp_path: Path, capsys: pytest.
             assert said == f"{picture}: agv2 red"  # agv1 is beyond the tile that there is
             assert picture.read_bytes()[:4] == b"\x89PNG"
         assert parser.main(["fleet", "--router", made.address]) == console.FAILED
-        assert "no robot tells anything" in capsys.readouterr().err
+        assert "no robot publishes" in capsys.readouterr().err
 
 
 def test_whoever_makes_up_names_and_messages_does_not_fill_the_viewer(
@@ -385,7 +385,7 @@ def test_who_asks_once_does_not_wait_for_ever(
     assert parser.main(["fleet", "--json", "--router", "tcp/127.0.0.1:1"]) == console.FAILED
     told = capsys.readouterr()
     assert told.out == ""
-    assert "no router answers at tcp/127.0.0.1:1 within 0.3 s: start one (`lumiloop fleet router`)" in told.err
+    assert "no router answers at tcp/127.0.0.1:1 within 0.3 s; start one with `lumiloop fleet router`" in told.err
 
 
 def test_what_is_new_in_a_message_is_skipped() -> None:

@@ -20,14 +20,14 @@ from tests.taps.routers import router
     ("words", "said"),
     [
         (["fleet", "--router", "nohost"], "Expected `host:port`"),
-        (["fleet", "--router", "nothing/x"], "'nothing' is no protocol; there are tcp, tls"),
+        (["fleet", "--router", "nothing/x"], "'nothing' is not a protocol; available: tcp, tls"),
         (["fleet", "--router", "tcp/127.0.0.1:1"], "waiting for it (Unable to connect"),
         (["fleet", "join", "--router", "a b:1"], "Expected `host:port`"),
         (["ros2", "--namespace", "agv-1"], "--namespace: Expected a namespace"),
-        (["fleet", "share"], "say what to share"),
+        (["fleet", "share"], "nothing to share is named"),
         (["fleet", "share", "--survey", "/none"], "/none: cannot be read: No such file"),
         (["fleet", "router", "--zenoh", "/none"], "/none"),
-        (["fleet", "fetch", "--switch", "--set", "modbus.port=0"], "--switch: the configuration switches Modbus off"),
+        (["fleet", "fetch", "--switch", "--set", "modbus.port=0"], "--switch: Modbus is disabled in the configuration"),
     ],
 )
 def test_what_cannot_be_is_said(
@@ -47,13 +47,13 @@ def test_what_cannot_be_is_said(
 def test_a_domain_that_ros_does_not_have_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         parser.main(["ros2", "--domain", "-1"])
-    assert "-1: ROS 2 has domains 0 to 232" in capsys.readouterr().err
+    assert "-1: out of range; ROS 2 has domains 0 to 232" in capsys.readouterr().err
 
 
 def test_what_is_not_shared_cannot_be_fetched(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         parser.main(["fleet", "fetch", "maps"])
-    assert "maps: name survey, map, or none for both\n" in capsys.readouterr().err
+    assert "maps: unknown; give survey or map, or nothing for both\n" in capsys.readouterr().err
     for words in ([], ["map"], ["survey", "map"]):
         assert parser.parser().parse_args(["fleet", "fetch", *words]).what == words
 

@@ -81,11 +81,11 @@ def test_a_damaged_map_is_refused_or_another_map(at: int, damage: bytes) -> None
 @pytest.mark.parametrize(
     ("attachment", "words"),
     [
-        (b"", "no message"),
+        (b"", "not a lumiloop message"),
         (messages.encode(msgspec.structs.replace(HEAD, schema=2)), "schema 2"),
         (messages.encode(msgspec.structs.replace(HEAD, rows=0)), "8 x 0"),
         (messages.encode(msgspec.structs.replace(HEAD, rows=10**9)), "8 x 1000000000"),
-        (messages.encode(msgspec.structs.replace(HEAD, rows=5)), "that should have 40"),
+        (messages.encode(msgspec.structs.replace(HEAD, rows=5)), "instead of 40"),
         (messages.encode(msgspec.structs.replace(HEAD, resolution=0.0)), "cells of 0.0 m"),
     ],
 )
@@ -104,7 +104,7 @@ def test_one_robot_that_tells_rubbish_does_not_hide_the_others() -> None:
     assert list(roster.members) == ["agv1", "agv2", "agv3"]
     assert [one.localised for one in roster.sorted()] == [True, False, False]
     (problem,) = roster.problems()
-    assert problem.startswith("agv2: pose: no message of a lumiloop")
+    assert problem.startswith("agv2: pose: not a lumiloop message")
     assert "agv2" in "\n".join(drawing.table(roster.sorted(), 6.0))
 
 
@@ -138,7 +138,7 @@ def test_who_is_there_twice_and_who_is_behind_is_said() -> None:
         roster.receive(messages.key(robot, "state"), messages.encode(state), b"", 1.0)
     twice, behind = roster.problems()
     assert twice.startswith("agv1: 2 robots have this name, on cart-7, cart9")
-    assert behind.startswith("agv1: not the newest survey, 7")
+    assert behind.startswith("agv1: the newest survey, 7")
     assert "104 no scan" in drawing.table(roster.sorted(), 2.0)[1]
     roster.without_router()
     assert [row.split()[2] for row in drawing.table(roster.sorted(), 2.0)[1:]] == ["GONE", "GONE"]
@@ -161,7 +161,7 @@ def test_robots_stand_on_the_map_where_they_are() -> None:
     lines = drawing.plan(chart, roster.sorted())
     assert [line[:8] for line in lines[:3]] == ["#.....2.", "#.1.....", "########"]
     pixels, said = drawing.picture(chart, roster.sorted())
-    assert said == ["agv1 blue", "agv2 red (where it was last)"]
+    assert said == ["agv1 blue", "agv2 red (last received pose)"]
     scale = len(pixels) // 6
     assert tuple(pixels[-(2 * scale + scale // 2), 2 * scale + scale // 2]) == drawing.COLOURS[0][1]
 

@@ -233,7 +233,7 @@ def test_five_robots_a_lossy_line_a_partition_and_a_dead_router(tmp_path: Path) 
         view.until(lambda: not view.told()["robots"][CUT]["alive"], 20.0)
         assert view.fresh() == everybody - {CUT}
         assert view.told()["problems"] == []
-        view.until(lambda: "has gone; waiting for it" in (tmp_path / f"{CUT}-join.log").read_text(), 20.0)
+        view.until(lambda: "is lost; waiting for it" in (tmp_path / f"{CUT}-join.log").read_text(), 20.0)
         network.link(CUT, "up")
         view.until(lambda: view.fresh() == everybody, 25.0)
 
@@ -243,4 +243,4 @@ def test_five_robots_a_lossy_line_a_partition_and_a_dead_router(tmp_path: Path) 
         hub.enter_context(network.program(HUB, *router))
         view.until(lambda: view.told()["router"] and view.fresh() == everybody, 25.0)
         for name in names():
-            assert "is back" in (tmp_path / f"{name}-join.log").read_text()
+            assert "again" in (tmp_path / f"{name}-join.log").read_text()

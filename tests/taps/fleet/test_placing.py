@@ -45,10 +45,10 @@ def test_a_survey_keeps_the_robots_own_receiver_and_the_file_before(tmp_path: Pa
     own = tmp_path / "lights.toml"
     where, note = install(offer, content, settings(tmp_path), None)
     assert where == own
-    assert "its receiver is the shared file's" in note
+    assert "its receiver comes from the shared file" in note
     own.write_text(dump(Survey(LAMPS[:1], Receiver(x=-0.25))))
     _, note = install(offer, content, settings(tmp_path), None)
-    assert "this robot's own" in note
+    assert "[receiver] of this robot is unchanged" in note
     placed = read_survey(own)
     assert placed.lamps == LAMPS
     assert placed.receiver.x == -0.25
@@ -77,7 +77,7 @@ def test_a_survey_is_read_for_the_air_interface_that_this_robot_has(tmp_path: Pa
     install(offer, content, given, None)
     assert read_survey(tmp_path / "lights.toml").depth == PROFILES["B"].depth
     path.write_text("lamp = [{ lamp_id = 1, code = 500, x = 0.0, y = 0.0, z = 3.0 }]")
-    with pytest.raises(Refused, match="code 500 is none of profile"):
+    with pytest.raises(Refused, match="code 500 is not in profile"):
         install(*offer_of(SURVEY, path, 2), settings(tmp_path), None)
 
 
@@ -111,7 +111,9 @@ def test_a_survey_that_cannot_be_checked_for_a_full_disk_is_refused(
 ) -> None:
     offer, content = offer_of(SURVEY, survey, 3)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
-    with pytest.raises(Refused, match=r"shared\.toml: cannot be checked, for want of a temporary file: No such file"):
+    with pytest.raises(
+        Refused, match=r"shared\.toml: cannot be checked, because no temporary file can be written: No such file"
+    ):
         install(offer, content, settings(tmp_path), None)
 
 
@@ -143,7 +145,7 @@ def test_beside_a_running_daemon_another_map_is_put_and_its_own_is_not_touched(
         assert daemon.load_map(0x77).stored.meta.map_id == 0x77
         daemon.save(map_maker.content(Shape(submaps=5)), 0x1234)
         assert where.exists()
-        with pytest.raises(Refused, match="a running daemon keeps map 00000077 there itself; stop it"):
+        with pytest.raises(Refused, match="a running daemon keeps map 00000077 there; stop the daemon"):
             install(offer, content, given, None)
     finally:
         daemon.close()
@@ -156,7 +158,7 @@ def test_what_is_damaged_on_the_way_is_refused_and_nothing_changes(
     offer, content = offer_of(kind, survey if kind == SURVEY else shared_map, 1)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     for spoilt in (content[:-1], content + b"\0", b"", content[:50] + b"\xff" + content[51:]):
-        with pytest.raises(Refused, match=f"{kind} .* version 1: what came .* is not what was announced"):
+        with pytest.raises(Refused, match=f"{kind} .* version 1: the content .* differs from the announced one"):
             install(offer, spoilt, settings(tmp_path), None)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -171,7 +173,7 @@ def test_what_is_no_survey_or_another_map_than_announced_is_refused(tmp_path: Pa
     with pytest.raises(Refused, match="cannot be read: No such file"):
         offer_of(MAP, tmp_path / "none", 1)
     offer, content = offer_of(MAP, shared_map, 1)
-    with pytest.raises(Refused, match="holds map 00000077, not 00000001 as announced"):
+    with pytest.raises(Refused, match="contains map 00000077, not 00000001 as announced"):
         install(msgspec.structs.replace(offer, map_id=1), content, settings(tmp_path), None)
     assert not (tmp_path / "maps").exists()
 
@@ -182,11 +184,11 @@ OFFER = Offer(kind=SURVEY, name="lights.toml", version=7, sha256="aa", size=1)
 @pytest.mark.parametrize(
     ("offers", "held", "words"),
     [
-        ([], None, "nobody shares a survey"),
-        ([msgspec.structs.replace(OFFER, kind=MAP)], None, "nobody shares a survey"),
-        ([OFFER], Held(8, "bb"), "version 7 is older than version 8, which is here; .*--version 9"),
-        ([OFFER], Held(7, "bb"), "version 7 is there with 2 different contents; .*--version 8"),
-        ([OFFER, msgspec.structs.replace(OFFER, sha256="cc")], None, "version 7 is there with 2 different contents"),
+        ([], None, "no robot shares a survey"),
+        ([msgspec.structs.replace(OFFER, kind=MAP)], None, "no robot shares a survey"),
+        ([OFFER], Held(8, "bb"), "version 7 is older than version 8, which is installed; .*--version 9"),
+        ([OFFER], Held(7, "bb"), "version 7 exists with 2 different contents; .*--version 8"),
+        ([OFFER, msgspec.structs.replace(OFFER, sha256="cc")], None, "version 7 exists with 2 different contents"),
     ],
 )
 def test_what_is_older_or_contradicts_itself_is_refused(offers: list[Offer], held: Held | None, words: str) -> None:

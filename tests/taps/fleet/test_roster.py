@@ -113,12 +113,12 @@ def test_maps_and_words_that_are_made_up_take_no_more_than_there_is_for_all(monk
     finally:
         tracemalloc.stop()
     assert kept < 2 * most
-    assert "forged99: state: a message of 1000" in "\n".join(made.problems())
+    assert "forged99: state: the message has 1000" in "\n".join(made.problems())
     made.receive(messages.key("forged0", "map"), *messages.map_message(HEAD, cells()), 2.0)
     made.receive(messages.key("forged50", "map"), *large, 2.0)
     assert made.members["forged50"].map is not None  # what another gave back
     made.receive(messages.key("forged60", "map"), *large, 2.0)
-    assert "forged60: map: no room" in "\n".join(made.problems())
+    assert "forged60: map: its map has" in "\n".join(made.problems())
     assert made.members["agv"].map is not None
 
 

@@ -65,12 +65,12 @@ def test_robots_follow_what_is_shared_and_refuse_what_is_older(
         async def until_said(words: str) -> None:
             await until(lambda: heard(words))
 
-        await until_said("nobody shares a survey")
+        await until_said("no robot shares a survey")
         await beside(until_said("survey shared.toml version 7 is in"), sharing(made, survey=survey, version=7))
         assert lamps() == LAMPS
         change()
         await beside(until_said("version 6 is older than version 7"), sharing(made, survey=survey, version=6))
-        await beside(until_said("version 7 is there with 2 different"), sharing(made, survey=survey, version=7))
+        await beside(until_said("version 7 exists with 2 different"), sharing(made, survey=survey, version=7))
         assert lamps() == LAMPS
         await beside(until_said("survey shared.toml version 8 is in"), sharing(made, survey=survey, version=8))
         assert lamps() == LAMPS[:2]
@@ -105,7 +105,7 @@ def test_what_comes_damaged_is_refused(tmp_path: Path, survey: Path, capsys: pyt
         one = fetcher(made, tmp_path)
         asyncio.run(one.run())
     assert one.failed
-    assert "is not what was announced" in capsys.readouterr().err
+    assert "differs from the announced one" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"shared.toml"}
 
 
@@ -152,7 +152,7 @@ def test_a_large_map_comes_whole_and_the_daemon_is_asked_only_if_that_is_wished(
             (found,) = (tmp_path / place / "lumiloop" / "maps").glob("*.lumimap")
             assert found.read_bytes() == path.read_bytes()
             assert asked == ([("lumiloop", "127.0.0.1", 1502, 0x77)] if wished else [])
-    assert "the daemon goes on in it" in capsys.readouterr().err
+    assert "the daemon uses the map now" in capsys.readouterr().err
 
 
 def test_a_switch_that_was_not_done_fails_and_is_asked_for_again(
@@ -169,7 +169,11 @@ def test_a_switch_that_was_not_done_fails_and_is_asked_for_again(
 
     monkeypatch.setattr("taps.fleet.fetch.switch_map", switch)
     with router() as made:
-        for failed, said in ((True, "is in"), (True, "refused"), (False, "here already; the daemon goes on in it")):
+        for failed, said in (
+            (True, "is in"),
+            (True, "refused"),
+            (False, "installed already; the daemon uses the map now"),
+        ):
             one = fetcher(made, tmp_path, what=[MAP], switch=True)
             asyncio.run(beside(one.run(), sharing(made, map=path, version=1)))
             assert one.failed is failed
@@ -198,10 +202,10 @@ def test_what_was_deleted_or_is_wanted_elsewhere_is_fetched_again(
     lights, other = tmp_path / "lights.toml", tmp_path / "other.toml"
     with router() as made:
         fetch(made)
-        assert fetch(made).count("is here already") == 2
+        assert fetch(made).count("is installed already") == 2
         lights.unlink()
         maps()[0].unlink()
-        assert "here already" not in fetch(made)
+        assert "installed already" not in fetch(made)
         assert lights.exists()
         assert len(maps()) == 1
         fetch(made, survey=other)
@@ -233,6 +237,6 @@ def test_who_offers_what_is_no_offer_does_not_keep_others_from_being_heard(
 
         asyncio.run(beside(patiently(), sharing(made, survey=survey, version=7)))
     said = capsys.readouterr().err
-    assert "what is offered as survey is not one" in said
+    assert "the shared survey is not valid" in said
     assert "version 7 is in" in said
     assert not one.failed

@@ -33,7 +33,7 @@ def test_the_map_that_was_fetched_is_asked_for() -> None:
 
 
 def test_a_daemon_that_does_not_go_on_in_it_is_a_failure() -> None:
-    with pytest.raises(Refused, match="asked to go on in it: refused; its log says why"):
+    with pytest.raises(Refused, match="did not switch to the map: refused; its log gives the cause"):
         ask(Outcome.REFUSED)
 
 

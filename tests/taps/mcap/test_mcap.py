@@ -194,7 +194,7 @@ def test_an_export_of_another_build_s_recording_says_so(
     monkeypatch.setattr("daemon.system.versions.build", lambda: "of today")
     assert parser.main(words) == console.OK
     said = capsys.readouterr()
-    assert f"{recording}: recorded with build {built}; this is build of today: the replay may differ" in said.err
+    assert f"{recording}: recorded with build {built}; this is build of today, so the replay may differ" in said.err
     assert said.out == ""
 
 
@@ -243,7 +243,7 @@ def test_of_a_killed_writer_all_but_the_last_half_second_is_there(
     with torn.open("rb") as file, pytest.raises((McapError, ValueError)):
         make_reader(file).get_summary()
     assert parser.main(["export", str(torn), "--mcap", str(whole)]) == console.OK
-    assert "its writer still writes or was killed" in capsys.readouterr().err
+    assert "its writer still runs or was killed" in capsys.readouterr().err
     (told,) = raw_messages(whole)
     assert 400 - 20 <= len(told) <= 400, "half a second at 40 Hz are 20"
 
@@ -276,17 +276,17 @@ def test_every_cut_and_every_damaged_place_is_survived(tmp_path: Path) -> None:
         assert len(told) == found.messages <= 120
     assert saved > 30
     source.write_bytes(data)
-    assert recover(source, target).sentence() == "120 messages over 3.0 s; the file was whole"
+    assert recover(source, target).sentence() == "120 messages over 3.0 s; the file was complete"
 
 
 def test_what_is_no_mcap_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a").write_bytes(b"nothing")
-    with pytest.raises(NotMcap, match="does not begin as one"):
+    with pytest.raises(NotMcap, match="its first bytes are wrong"):
         recover(tmp_path / "a", tmp_path / "b")
     assert parser.main(["export", str(tmp_path / "none"), "--mcap", str(tmp_path / "b")]) == console.FAILED
     assert parser.main(["export", str(tmp_path / "a")]) == console.USAGE
     said = capsys.readouterr().err
-    assert "say what to write" in said
+    assert "no output is named" in said
     assert not (tmp_path / "b").exists()
 
 
@@ -297,9 +297,9 @@ def test_an_mcap_file_is_neither_written_over_itself_nor_made_into_a_trajectory(
     file.write_bytes((exported / "drive.mcap").read_bytes())
     before = file.read_bytes()
     assert parser.main(["export", str(file), "--mcap", str(tmp_path / "x" / ".." / "drive.mcap")]) == console.USAGE
-    assert "name another one" in capsys.readouterr().err
+    assert "name another file" in capsys.readouterr().err
     assert parser.main(["export", str(file), "--tum", str(tmp_path / "t")]) == console.USAGE
-    assert "made of the recording itself" in capsys.readouterr().err
+    assert "from the recording itself" in capsys.readouterr().err
     assert file.read_bytes() == before
 
 
@@ -315,14 +315,14 @@ def test_an_export_never_writes_over_what_it_reads_nor_over_itself(
     for log in (segment, segment.parent):
         assert parser.main(["export", str(log), option, str(tmp_path / "link")]) == console.USAGE
         said = capsys.readouterr().err
-        assert f"{option} {tmp_path / 'link'}: is the file that is read; name another one" in said
+        assert f"{option} {tmp_path / 'link'}: this is the input file; name another file" in said
     other = "--kitti" if option == "--tum" else "--tum"
     assert parser.main(["export", str(segment), option, str(tmp_path / "t"), other, f"{tmp_path}/./t"]) == console.USAGE
-    assert "writes, too; name another one" in capsys.readouterr().err
+    assert "; name another file" in capsys.readouterr().err
     assert segment.read_bytes() == before
     assert not (tmp_path / "t").exists()
     assert parser.main(["export", str(segment), option, str(tmp_path / "none" / "t")]) == console.USAGE
-    assert f"there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
+    assert f"no folder {tmp_path / 'none'}; create it" in capsys.readouterr().err
 
 
 def test_an_mcap_file_that_is_there_is_replaced_only_when_asked(
@@ -333,7 +333,7 @@ def test_an_mcap_file_that_is_there_is_replaced_only_when_asked(
     there.write_bytes(b"a day of a robot")
     command = ["export", str(exported / "drive.mcap"), "--mcap", str(there)]
     assert parser.main(command) == console.USAGE
-    assert "is there already; name another file, or replace it with --force" in capsys.readouterr().err
+    assert "exists already; name another file, or replace it with --force" in capsys.readouterr().err
     assert there.read_bytes() == b"a day of a robot"
     assert parser.main([*command, "--force"]) == console.OK
     assert messages(there)

@@ -58,8 +58,8 @@ def test_what_is_there_stays_and_nobody_is_waited_for_in_vain(
     assert record(tmp_path / "s", tmp_path / "none" / "b.mcap") == console.USAGE
     said = capsys.readouterr().err
     assert "replace it with --force" in said
-    assert "is the daemon running?" in said
-    assert "there is no folder" in said
+    assert "check that the daemon runs" in said
+    assert ": no folder" in said
 
 
 def test_nothing_told_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,7 +68,7 @@ def test_nothing_told_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     with other_version(tmp_path / "t"):
         assert record(tmp_path / "t", tmp_path / "b.mcap") == console.FAILED
     said = capsys.readouterr().err
-    assert "nothing was told, and no file is left; is the daemon running?" in said
+    assert "no data were received, so no file was written; check that the daemon runs" in said
     assert "install both from the same release" in said
     assert not list(tmp_path.glob("*.mcap"))
     assert record(tmp_path / "s", Path("/dev/null"), "--force") == console.FAILED
@@ -103,8 +103,8 @@ def test_a_disk_is_not_filled(
     with served(tmp_path / "s"):
         assert record(tmp_path / "s", out, "--seconds", "20") == console.FAILED
     said = capsys.readouterr().err
-    assert f"{out}: stopped, only 199 MB are free there (--reserve keeps 200): " in said
-    assert "the file is whole up to here" in said
+    assert f"{out}: stopped, only 199 MB are free there (--reserve requires 200): " in said
+    assert "the file is complete up to here" in said
     with out.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None, "there is an index"
@@ -125,7 +125,7 @@ def test_a_folder_that_is_not_there_is_named_before_any_daemon_is_waited_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert record(tmp_path / "s", tmp_path / "none" / "a.mcap", "--seconds", "2") == console.USAGE
-    assert f"there is no folder {tmp_path / 'none'}; make it" in capsys.readouterr().err
+    assert f"no folder {tmp_path / 'none'}; create it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("seconds", ["-1", "0", "nan"])
@@ -133,7 +133,7 @@ def test_a_time_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
     """It had been taken for no time at all, and recorded for ever."""
     with pytest.raises(SystemExit):
         record(tmp_path / "s", tmp_path / "a.mcap", "--seconds", seconds)
-    assert f"{seconds} s: name more than 0" in capsys.readouterr().err
+    assert f"{seconds} s: out of range; give more than 0" in capsys.readouterr().err
 
 
 def test_a_disk_that_is_full_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -182,7 +182,7 @@ def test_a_page_whose_name_was_turned_to_this_computer_reads_nothing(bind: str, 
     answering = server.HttpHandler(Latest(), Guard(bind=bind))
     said = answering._answer(b"GET /metrics HTTP/1.1\r\n" + named + b"\r\n")
     assert said.split(b" ")[1] == status
-    assert (b"under a name that is not its own" in said) == (status == b"403")
+    assert (b"the request names another host" in said) == (status == b"403")
 
 
 def test_of_a_daemon_that_has_gone_the_last_place_is_told_and_of_the_next_one_its_own() -> None:
@@ -201,9 +201,9 @@ def test_of_a_daemon_that_has_gone_the_last_place_is_told_and_of_the_next_one_it
         "positionInitialized": False, "localizationScore": 0.0,
     }  # fmt: skip
     told.update(Hello(schema=1, name="agv", pid=2), 9.0)
-    assert b"there is no pose yet" in answering._answer(request)
+    assert b"no pose is available yet" in answering._answer(request)
     told.update(msgspec.structs.replace(POSE, state=int(State.LOST), pose=None), time.monotonic())
-    assert b"there is no pose yet" in answering._answer(request)
+    assert b"no pose is available yet" in answering._answer(request)
 
 
 def test_a_robot_that_is_lost_is_not_localized() -> None:

@@ -119,9 +119,9 @@ def test_who_comes_late_gets_what_stands_still_also_after_the_router_was_gone(
         await asyncio.sleep(1.5)
         await late(made)
         made.end()
-        await until(lambda: "has gone; waiting for it" in capsys.readouterr().err)
+        await until(lambda: "is lost; waiting for it" in capsys.readouterr().err)
         made.begin()
-        await until(lambda: "is back" in capsys.readouterr().err)
+        await until(lambda: "again" in capsys.readouterr().err)
         await late(made)
 
     with served(tmp_path / "s"), router() as made:

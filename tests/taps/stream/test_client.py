@@ -110,7 +110,7 @@ async def test_a_daemon_that_goes_is_told_once_and_one_that_comes_is_greeted(
         async for frame in heard:
             seen.append(type(frame).__name__)
             if isinstance(frame, Lost) and len(seen) == 1:
-                assert "is the daemon running?" in frame.text
+                assert "check that it runs" in frame.text
                 serving = serve(path)
             elif isinstance(frame, Hello) and len(seen) == 2:
                 assert serving is not None
@@ -144,7 +144,7 @@ def test_a_daemon_of_another_name_is_named(tmp_path: Path) -> None:
 
     said = asyncio.run(body())
     assert "agv runs here: `--set name=agv`, or `--config`" in said
-    assert "old" not in said.partition("nobody listens there")[2]
+    assert "old" not in said.partition("no daemon listens there")[2]
 
 
 def serve(path: Path) -> asyncio.Task[None]:
@@ -186,11 +186,14 @@ HELLO = {"topic": "hello", "schema": SCHEMA, "name": "agv", "pid": 1, "topics": 
     ("said", "text"),
     [
         (framed({**HELLO, "schema": SCHEMA + 1}), "install both from the same release"),
-        (framed({"topic": "error", "text": "32 clients are being served; close one"}), "32 clients are being served"),
-        (b"HTTP/1.0 400 Bad Request\r\n", "is this the stream of a lumiloop"),
-        (framed({"topic": "pose", "data": {}}), "cannot be read"),
-        (framed({"topic": "of tomorrow", "data": {}}), "does not greet"),
-        (framed(HELLO) + b"\x03\x00\x00\x00abc", "cannot be read"),
+        (
+            framed({"topic": "error", "text": "all 32 connections are in use; close one"}),
+            "all 32 connections are in use",
+        ),
+        (b"HTTP/1.0 400 Bad Request\r\n", "this is not a lumiloop stream"),
+        (framed({"topic": "pose", "data": {}}), "cannot be decoded"),
+        (framed({"topic": "of tomorrow", "data": {}}), "sends no hello message"),
+        (framed(HELLO) + b"\x03\x00\x00\x00abc", "cannot be decoded"),
     ],
 )
 def test_who_is_no_daemon_of_this_version_is_told(tmp_path: Path, said: bytes, text: str) -> None:
@@ -199,7 +202,7 @@ def test_who_is_no_daemon_of_this_version_is_told(tmp_path: Path, said: bytes, t
 
 def test_one_that_never_greets_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client, "SILENT_S", 0.05)
-    assert "the daemon stands" in answering(tmp_path / "s", b"")
+    assert "the daemon does not respond" in answering(tmp_path / "s", b"")
 
 
 def test_a_topic_of_tomorrow_is_skipped() -> None:
@@ -207,7 +210,7 @@ def test_a_topic_of_tomorrow_is_skipped() -> None:
 
 
 def test_a_wrong_topic_is_no_request() -> None:
-    with pytest.raises(ValueError, match="no such topic: poses; there are pose"):
+    with pytest.raises(ValueError, match="no such topic: poses; available: pose"):
         Stream(Path("x"), ("poses",))
 
 

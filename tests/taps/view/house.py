@@ -101,7 +101,7 @@ async def serving(
     again: Callable[[], Scene] | None = None,
 ) -> AsyncIterator[House]:
     path = folder / "stream"
-    stream = StreamServer(path, "agv", lambda reason: ("as it should be", ""))
+    stream = StreamServer(path, "agv", lambda reason: ("is received as expected again", ""))
     task = asyncio.create_task(stream.run())
     source = None if film is not None else Stream(path, TOPICS)
     view = View(guard or Guard("127.0.0.1"), scene or Scene("agv"), source, film, ("127.0.0.1", modbus), again)

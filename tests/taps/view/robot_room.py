@@ -35,7 +35,7 @@ FAULTS: Final = [
     {"fault": 231, "meaning": "the computer is too slow", "remedy": "stop other programs: `top`", "cause": 0},
     {"fault": 102, "meaning": "scans are missing", "remedy": "look at the cable", "cause": 231},
     {"fault": 233, "meaning": "cycles are over budget", "remedy": "a faster computer", "cause": 102},
-    {"fault": 171, "meaning": "lamp 74 is not where the survey has it", "remedy": "survey it anew", "cause": 0},
+    {"fault": 171, "meaning": "lamp 74 is not where the survey has it", "remedy": "survey it again", "cause": 0},
 ]
 """The two in the middle follow from the first, one of them through the other."""
 

@@ -199,7 +199,7 @@ def test_without_the_right_token_a_page_only_looks(browser: str, address: str) -
             loop = f"{{counter: {number}, keyframe_new: {number}, keyframe_old: 0, residual: 0.01, reason: 0}}"
             await page.js(f"lumiloop.link.told.frame('loop', {loop})")
         said = await page.js("[...document.querySelectorAll('.toast')].map((one) => one.textContent)")
-        assert "That token is not the right one: read-only" in said
+        assert "Wrong token. The page is read-only." in said
         assert len(said) == 3
         assert await page.js("document.getElementById('card-orders').hidden")
         assert await shown(page, "mode") == "read-only"
@@ -243,12 +243,12 @@ def test_the_daemon_is_gone_and_the_page_says_so(browser: str, tmp_path: Path) -
     async def body(address: str) -> None:
         async with tab(browser, address) as page:
             await page.until("globalThis.lumiloop")
-            await page.until("document.getElementById('banner').textContent.includes('is the daemon running?')")
+            await page.until("document.getElementById('banner').textContent.includes('check that it runs')")
             await page.until("document.getElementById('state-name').textContent === 'NO DAEMON'")
             assert page.said == []
         async with tab(browser, address, PHONE, phone=True) as page:  # the name of a socket is long, and has no gaps
             await page.until("globalThis.lumiloop")
-            await page.until("document.getElementById('banner').textContent.includes('is the daemon running?')")
+            await page.until("document.getElementById('banner').textContent.includes('check that it runs')")
             beside = await page.js(
                 "[document.getElementById('banner'), document.querySelector('.tools')].map((one) => ["
                 "one.scrollWidth - one.clientWidth, one.getBoundingClientRect().left,"

@@ -166,7 +166,7 @@ async def test_a_browser_too_many_comes_in_when_another_goes(
         await first.welcome()
         async with tab(browser, house.address) as page:
             await page.until("globalThis.lumiloop")
-            await shows(page, "of one computer; close one. Trying again.")
+            await shows(page, "from one computer; close one. Trying again.")
             await first.socket.close()
             house.stream.publish(snapshot(1))
             await page.until(f"{POSE} === 1", 20.0)

@@ -43,7 +43,7 @@ async def test_another_daemon_is_not_ordered_about(tmp_path: Path, other: tuple[
         await page.welcome()
         await page.socket.send_json({"order": "set_pose", "pose": [1.0, 2.0, 0.0]})
         said = (await page.until("order"))["outcome"]
-    assert f"127.0.0.1:{port} is answered by process {process.pid}" in said
+    assert f"127.0.0.1:{port} belongs to process {process.pid}" in said
     assert "--config" in said
     process.kill()
     assert process.stdout is not None
@@ -57,7 +57,7 @@ async def test_nor_is_its_map_switched(
     path = stream_path("agv")
     server = await asyncio.start_unix_server(lambda reader, writer: writer.close(), path)
     try:
-        with pytest.raises(CommandRefused, match="not by the daemon that is meant"):
+        with pytest.raises(CommandRefused, match="name its configuration with --config, or give"):
             await switch_map("agv", "127.0.0.1", other[0], 1)
     finally:
         server.close()

@@ -24,7 +24,7 @@ async def test_who_says_nothing_takes_no_viewer_s_place(tmp_path: Path, monkeypa
         silent = [await house.session.ws_connect(f"{house.address}/ws") for _ in range(8)]
         async with house.page(TOKEN) as page:
             assert (await page.welcome())["kind"] == "welcome"
-        assert (await silent[0].receive_json(timeout=5.0))["text"] == "Others came before it said who it is."
+        assert (await silent[0].receive_json(timeout=5.0))["text"] == "Other clients connected first."
         assert not silent[-1].closed
         for one in silent:
             await one.close()
@@ -57,7 +57,7 @@ async def test_what_cannot_be_sent_ends_that_connection_aloud(
             pass
         assert page.socket.close_code == 1011
         await other.until("pose")
-    assert any(record.exc_info and "could not be told" in record.message for record in caplog.records)
+    assert any(record.exc_info and "sending to a browser has failed" in record.message for record in caplog.records)
 
 
 async def test_damaged_requests_leave_one_line_and_no_traceback(

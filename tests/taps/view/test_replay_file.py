@@ -142,7 +142,7 @@ def test_a_film_whose_maker_has_died_says_so(film: ReplayFile, tmp_path: Path) -
     alive = False
     watched.refresh()
     assert (watched.done, watched.t_last) == (True, 20.0)
-    assert "died before its end" in watched.error
+    assert "has ended early" in watched.error
     watched.close()
     film.close()
 
@@ -150,7 +150,7 @@ def test_a_film_whose_maker_has_died_says_so(film: ReplayFile, tmp_path: Path) -
 def test_a_disk_that_is_full_is_named(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command._record(recording, Config(), (False, ()), Path("/dev/full"))
     said = capsys.readouterr().err
-    assert "/dev/full: No space left on device; the recording is shown as far" in said
+    assert "/dev/full: No space left on device; the recording is shown up to there" in said
 
 
 def test_a_recording_that_ends_early_does_not_look_whole() -> None:
@@ -204,7 +204,7 @@ def test_a_recording_is_shown_from_its_beginning_and_takes_no_orders(recording: 
 
 def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
     log, file = tmp_path / "log.clf", tmp_path / "film"
-    log.write_text("nothing of use\n")
+    log.write_text("a daemon is present, but its data cannot be used\n")
     command._record(log, Config(), (False, ()), file)
     film = ReplayFile(log, file)
     film.refresh()

@@ -50,7 +50,7 @@ def test_a_daemon_that_begins_with_another_survey(tmp_path: Path, caplog: pytest
 
     caplog.set_level(logging.WARNING)
     asyncio.run(body())
-    assert "shown as they were before: lights.toml, line 3: lamp 7 twice" in caplog.text
+    assert "the previous lamps and mount are shown: lights.toml, line 3: lamp 7 twice" in caplog.text
 
 
 def test_what_is_read_is_the_files_as_they_are_now(tmp_path: Path) -> None:

@@ -261,7 +261,7 @@ async def test_a_newcomer_after_many_loops_is_told_how_things_stand(tmp_path: Pa
     hub, viewer = viewers.Hub(), viewers.Viewer(1)
     for number in range(2 * viewers.KEPT):
         hub.distribute(Loop(t_mono=float(number), counter=number))
-    hub.disconnected("nobody listens there")
+    hub.disconnected("no daemon listens there")
     hub.welcome(viewer)
     message = viewer.next_message()
     assert message is not None

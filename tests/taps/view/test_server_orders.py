@@ -137,13 +137,13 @@ def test_another_map_that_somebody_names_in_between_is_no_map_of_ours(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ({"order": "reset"}, "no order"),
-        ({"order": "set_pose"}, "wants a pose"),
-        ({"order": "set_pose", "pose": [1, 2, "3"]}, "wants a pose"),
-        ({"order": "set_pose", "pose": [1, 2, float("nan")]}, "wants a pose"),
+        ({"order": "reset"}, "unknown command"),
+        ({"order": "set_pose"}, "set_pose needs x and y"),
+        ({"order": "set_pose", "pose": [1, 2, "3"]}, "set_pose needs x and y"),
+        ({"order": "set_pose", "pose": [1, 2, float("nan")]}, "set_pose needs x and y"),
         ({"order": "set_pose", "pose": [1e9, 2, 0]}, "away"),
-        ({"order": "set_pose", "pose": [10**400, 2, 0]}, "wants a pose"),
-        ({"order": ["x"]}, "no order"),
+        ({"order": "set_pose", "pose": [10**400, 2, 0]}, "set_pose needs x and y"),
+        ({"order": ["x"]}, "unknown command"),
     ],
 )
 def test_orders_that_cannot_be_given(tmp_path: Path, words: dict[str, Any], said: str) -> None:

@@ -197,7 +197,7 @@ def test_a_robot_is_carried_away_and_watched_until_it_is_found(tmp_path: Path) -
     assert orders == ["order carry where=robot ahead=32 takes=2"]
     assert (act.seen, act.right, act.back) == pytest.approx((0.5, 1.0, 6.0), abs=0.11)
     assert act.jumps == (3, 4)
-    assert told[:2] == ["the robot is lifted and carried away", "the robot is put down"]
+    assert told[:2] == ["the robot is lifted and moved to another position", "the robot is put down"]
     assert "right again" in told[2]
     assert complaint([act]) == ""
     act.right = None

@@ -184,7 +184,7 @@ def test_align_moves_everything_and_begins_a_frame_of_its_own(file: Path, capsys
     assert run("align", file, *words) == console.OK
     said = capsys.readouterr().out
     assert "yaw 28.65 deg" in said
-    assert "points are off by" in said
+    assert "Residuals of the points" in said
     store = Store(file.parent)
     start = store.load()
     assert start is not None
@@ -200,12 +200,12 @@ def test_align_moves_everything_and_begins_a_frame_of_its_own(file: Path, capsys
 @pytest.mark.parametrize(
     ("points", "says"),
     [
-        (["0,0=1,1"], "two points at least"),
+        (["0,0=1,1"], "at least two points are needed, far apart"),
         (["0,0=1,1", "0.1,0=1.1,1"], "lie within 0.10 m"),
-        (["0,0=0,0", "10,0=11,0"], r"distances disagree: \+10.0 %"),
-        (["0,0=0,0", "10,0=10,0", "0,10=0.5,10"], "distances disagree"),
-        (["0,0=0,0", "nonsense"], "--point nonsense: write"),
-        (["0,0=0,0", "1,2,3=4"], "--point 1,2,3=4: write"),
+        (["0,0=0,0", "10,0=11,0"], r"distances of the points differ by \+10.0 %"),
+        (["0,0=0,0", "10,0=10,0", "0,10=0.5,10"], "distances of the points differ"),
+        (["0,0=0,0", "nonsense"], "--point nonsense: expected"),
+        (["0,0=0,0", "1,2,3=4"], "--point 1,2,3=4: expected"),
     ],
 )
 def test_points_that_do_not_fit_are_refused(
@@ -285,7 +285,7 @@ def test_a_place_that_cannot_be_written_is_named(
     out = tmp_path / "none" / "b.lumimap"
     assert parser.main(["map", "name", str(file), "hall", "--out", str(out)]) == console.FAILED
     said = capsys.readouterr().err
-    assert f"{out}: cannot be written: No such file or directory; name another place with --out FILE" in said
+    assert f"{out}: cannot write the map: No such file or directory; name another file with --out FILE" in said
 
 
 def test_a_drawing_of_more_floor_than_can_be_imported_is_refused(
@@ -294,5 +294,5 @@ def test_a_drawing_of_more_floor_than_can_be_imported_is_refused(
     Image.fromarray(np.full((250, 250), 254, np.uint8)).save(tmp_path / "map.pgm")
     (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 1.0\norigin: [0, 0, 0]\n")
     assert run("import", tmp_path / "map.yaml", "--out", tmp_path / "new.lumimap") == console.FAILED
-    assert "has 62500 m2 of free floor; at most 50000 can be imported" in capsys.readouterr().err
+    assert "the map has 62500 m2 of free ground; at most 50000 can be imported" in capsys.readouterr().err
     assert not (tmp_path / "new.lumimap").exists()

@@ -86,13 +86,13 @@ def test_verify_says_of_each_file_whether_it_is_good(tmp_path: Path, capsys: pyt
     torn.write_bytes(content(Shape(submaps=8, loose=2)))
     assert parser.main(["map", "verify", str(good), str(torn)]) == console.OK
     said = capsys.readouterr().out
-    assert f"{good}: good, map 00001234\n" in said
-    assert "2 submaps joined with the rest by nothing" in said
+    assert f"{good}: valid, map 00001234\n" in said
+    assert "2 submaps without an edge to the others" in said
     assert parser.main(["map", "verify", str(good), str(bad), str(tmp_path / "none")]) == console.FAILED
     said = capsys.readouterr().err
     assert f"{bad}: it is" in said
-    assert "cut off" in said
-    assert "none: cannot be read: No such file or directory" in said
+    assert "truncated" in said
+    assert "none: cannot read the map: No such file or directory" in said
     assert parser.main(["map", "info", str(bad)]) == console.FAILED
 
 

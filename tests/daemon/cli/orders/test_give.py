@@ -168,14 +168,14 @@ async def test_an_order_that_does_not_end_is_said(
         monkeypatch.setattr(robot, "publish", lambda: None)
         code, _, err = await lumiloop("relocalise", "--timeout", "0.2")
         assert code == console.FAILED
-        assert "not finished after 0.2 s; the order stays in force" in err
+        assert "not finished after 0.2 s; the command continues" in err
 
 
 async def test_where_no_daemon_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lumiloop: Said) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     code, _, err = await lumiloop("pause")
     assert code == console.FAILED
-    assert "no daemon runs: start `lumiloop run`" in err
+    assert "no daemon runs; start one with `lumiloop run`" in err
 
 
 async def test_a_daemon_of_another_name_is_named(
@@ -184,7 +184,7 @@ async def test_a_daemon_of_another_name_is_named(
     async with driving(tmp_path, monkeypatch):
         code = await asyncio.to_thread(parser.main, ["pause", "--set", "name=other"])
         assert code == console.FAILED
-        assert "no daemon is named other; these run: agv" in capsys.readouterr().err
+        assert "no daemon has the name other; running daemons: agv" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

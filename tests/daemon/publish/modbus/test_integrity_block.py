@@ -74,10 +74,10 @@ def test_status_shows_the_bound() -> None:
     reading = registers.decode_block(registers.encode_block(taken))
     reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(taken))
     table = status_table.as_table(reading, stalled=False)
-    assert "bound      0.124 m, 2.01 deg (laser, wheels)  ALERT, limit 0.500 m" in table
-    assert "places     3 fit" in table
+    assert "protection 0.124 m, 2.01 deg (lidar, odometry)  ALERT, limit 0.500 m" in table
+    assert "hypotheses 3" in table
     assert "residual 0.0123 m" in table
     assert as_object(reading, stalled=False)["integrity"]["witnesses"]["alert"] is True
     reading = registers.decode_block(registers.encode_block(snapshot()))
     reading |= integrity_block.BLOCK.decode(integrity_block.BLOCK.encode(snapshot()))
-    assert "bound      none" in status_table.as_table(reading, stalled=False)
+    assert "protection none" in status_table.as_table(reading, stalled=False)

@@ -59,7 +59,7 @@ def test_status_tells_all_faults_and_what_was_restarted() -> None:
     for words in (
         "104: the lidar",
         "151: the photodiode",
-        "201: configured odometry",
+        "201: odometry is configured",
         "restarted: LIDAR 1, PHOTODIODE",
     ):
         assert words in table
@@ -86,7 +86,7 @@ def test_status_shows_what_follows_from_a_fault_below_it() -> None:
     shown = [line[10:] for line in lines[first : first + 5]]
     assert [line.split(":")[0] for line in shown] == [" 104", " 306", "   follows", "   follows", " 401"]
     assert "106: more than 2 % of the lidar's scans" in shown[2]
-    assert "take load off" not in shown[3], "the remedy is that of the cause"
+    assert "reduce the load" not in shown[3], "the remedy is that of the cause"
     told = as_object(reading, False)["faults"]
     assert [(one["number"], one["cause"]) for one in told] == [
         (104, None), (306, None), (106, 306), (301, 306), (401, None)

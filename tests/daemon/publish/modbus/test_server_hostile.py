@@ -316,7 +316,7 @@ def test_one_host_never_takes_all_connections(caplog: pytest.LogCaptureFixture) 
         assert all(served(*one) for one in honest)
 
     in_virtual_time(body)
-    assert any("it has 24 of the 32 connections" in record.message for record in caplog.records)
+    assert any("it uses 24 of the 32 connections" in record.message for record in caplog.records)
 
 
 def test_in_a_full_house_the_host_with_most_makes_place_for_another_one() -> None:

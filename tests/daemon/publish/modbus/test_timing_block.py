@@ -56,4 +56,4 @@ def test_status_tells_what_is_left_out_and_when_it_stood_still() -> None:
     table = status_table.as_table(
         reading | timing_block.BLOCK.decode(timing_block.BLOCK.encode(snapshot(pulse=PULSE))), stalled=False
     )
-    assert "99 of 100 within 0.00800 s; no map work either; stood still 4 times, latest 0.123 s in MATCH" in table
+    assert "99 of 100 within 0.00800 s; also no map work; 4 stalls, latest 0.123 s in MATCH" in table

@@ -188,11 +188,11 @@ async def test_a_client_that_never_reads_is_let_go(tmp_path: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("request_", "part"),
     [
-        (b"\xff\xff\xff\xff", "longest"),
-        (b"\x01\x00\x00\x00\xc1", "no msgpack map"),
-        (b"\x04\x00\x00\x00\x81\xa1\xff\xc0", "no msgpack map"),
-        (b"\x01\x00\x00\x00\x80", "without `want`"),
-        ((4007).to_bytes(4, "little") + b"\x81\xa4want" + b"\x91" * 4000 + b"\xc0", "a request"),
+        (b"\xff\xff\xff\xff", "the limit is"),
+        (b"\x01\x00\x00\x00\xc1", "the request is not a msgpack map"),
+        (b"\x04\x00\x00\x00\x81\xa1\xff\xc0", "the request is not a msgpack map"),
+        (b"\x01\x00\x00\x00\x80", "has no `want`"),
+        ((4007).to_bytes(4, "little") + b"\x81\xa4want" + b"\x91" * 4000 + b"\xc0", "the request"),
         (b"\x08\x00\x00\x00\x81\xa4want\x91\xa0"[:12], None),
     ],
 )
@@ -216,7 +216,7 @@ async def test_an_unknown_topic_is_named(tmp_path: Path) -> None:
     async with running(tmp_path / "stream") as server:
         tap = await connected(server)
         tap.ask({"want": ["pose", "weather"]})
-        assert "weather; there are pose" in (await tap.frame())["text"]
+        assert "weather; available: pose" in (await tap.frame())["text"]
 
 
 @pytest.mark.virtual
@@ -248,7 +248,7 @@ async def test_too_many_clients_are_told_so(tmp_path: Path, monkeypatch: pytest.
     async with running(tmp_path / "stream") as server:
         taps = [await connected(server) for _ in range(2)]
         late = Tap(*await asyncio.open_unix_connection(str(server.path)))
-        assert "2 clients" in (await late.frame())["text"]
+        assert "all 2 connections" in (await late.frame())["text"]
         taps[0].writer.close()
         await until(lambda: len(server.clients) < 2)
         await connected(server)
@@ -263,15 +263,15 @@ async def test_one_program_and_one_user_never_have_all_places(tmp_path: Path, mo
         for _ in range(16):
             await connected(server)
         assert {(client.process, client.user) for client in server.clients} == {(os.getpid(), os.geteuid())}
-        assert await refused(server) == "this program has 16 of the 32 places; close one"
+        assert await refused(server) == "this program uses 16 of 32 connections; close one"
         monkeypatch.setattr(stream_session, "credentials", lambda _: (1, os.geteuid()))
         for _ in range(8):
             await connected(server)
-        assert await refused(server) == "this user's programs have 24 of the 32 places; close one"
+        assert await refused(server) == "this user's programs use 24 of 32 connections; close one"
         monkeypatch.setattr(stream_session, "credentials", lambda _: (2, 1 + os.geteuid()))
         for _ in range(8):
             await connected(server)
-        assert await refused(server) == "32 clients are being served; close one"
+        assert await refused(server) == "all 32 connections are in use; close one"
 
 
 async def test_a_path_left_by_a_dead_program_is_taken(tmp_path: Path) -> None:

@@ -196,7 +196,7 @@ async def test_drawing_that_has_failed_is_tried_again(
         assert tiles.tiles
         assert not tiles.error
         tiles.close()
-    assert caplog.text.count("it is tried again") == 2
+    assert caplog.text.count("the daemon tries again") == 2
 
 
 async def test_a_stuck_client_gets_the_tiles_when_it_has_caught_up(

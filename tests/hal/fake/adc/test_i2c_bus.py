@@ -226,7 +226,7 @@ def test_clip() -> None:
     [
         ({"what": "dc_off"}, "no DC channel"),
         ({"what": "foreign"}, "no DC channel"),
-        ({"what": "moved", "address": 0x4D}, "a chip already"),
+        ({"what": "moved", "address": 0x4D}, "another device has this address already"),
     ],
 )
 def test_orders_that_make_no_sense(table: dict[str, object], says: str) -> None:

@@ -53,7 +53,7 @@ class Receiver:
         first = self.process.stdout.readline()
         assert " on " in first, first
         self.where = first.split(" on ")[1].strip()
-        assert "fault orders" in self.process.stdout.readline()
+        assert "fault commands" in self.process.stdout.readline()
 
     def stop(self, number: int = signal.SIGTERM) -> int:
         assert self.process is not None
@@ -129,8 +129,8 @@ def test_blocks_come_and_are_what_they_should_be(where: str, tmp_path: Path) -> 
     ("order", "noun", "says"),
     [
         ("order off for=3", DeviceMissing, "no MCP3221 answers at address 0x4d"),
-        ("order hang for=4", DeviceFault, "nothing has been read for 5 blocks|bus is stuck"),
-        ("order gone for=3", DeviceMissing, "adapter is gone|no such bus"),
+        ("order hang for=4", DeviceFault, "no data were read for 5 blocks|bus is stuck"),
+        ("order gone for=3", DeviceMissing, "adapter was removed|no such bus"),
         ("order dark for=3", DeviceFault, "dark: no light|no light at all"),
     ],
 )

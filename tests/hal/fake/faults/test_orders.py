@@ -62,14 +62,17 @@ def test_intermittent_has_a_share_of_its_own() -> None:
     [
         (
             "[[fault]]\nwhat = 'bitflip'\nwhere = 'lidar'",
-            r"^fault\[0\]\.what: 'bitflip' is no fault of 'lidar'; known: alien",
+            r"^fault\[0\]\.what: 'bitflip' is not a fault of 'lidar'; available: alien",
         ),
-        ("[[fault]]\nwhere = 'lidar'", r"^fault\[0\]\.what: None is no fault"),
+        ("[[fault]]\nwhere = 'lidar'", r"^fault\[0\]\.what: None is not a fault"),
         ("[[fault]]\nwhat = 3\nwhere = 'lidar'", r"^fault\[0\]\.what: expected a text, got 3"),
         ("[[fault]]\nwhat = 'off'", r"^fault\[0\]\.where: name one of lidar, adc"),
         ("[[fault]]\nwhat = 'off'\nwhere = 'gyro'", r"^fault\[0\]\.where: 'gyro'"),
         ("[[fault]]\nwhat='off'\nwhere='adc'\n[[fault]]\nwhat='dark'\nwhere='adc'", r"^fault\[1\]\.what: 'dark'"),
-        ("[[fault]]\nwhat='bit_flip'\nwhere='lidar'\npart='dta'", r"^fault\[0\]\.part: 'dta' is none of echo, status"),
+        (
+            "[[fault]]\nwhat='bit_flip'\nwhere='lidar'\npart='dta'",
+            r"^fault\[0\]\.part: 'dta' is not one of echo, status",
+        ),
         ("[[fault]]\nwhat='bit_flip'\nwhere='lidar'\nbit=8", r"^fault\[0\]\.bit: 8 is outside -1\.\.\.7"),
         ("[[fault]]\nwhat='bit_flip'\nwhere='lidar'\nbit='3'", r"^fault\[0\]\.bit: expected a int, got '3'"),
         ("[[fault]]\nwhat='bit_flip'\nwhere='lidar'\ncount=true", r"^fault\[0\]\.count: expected a int, got True"),
@@ -83,7 +86,7 @@ def test_intermittent_has_a_share_of_its_own() -> None:
         ("[[fault]]\nwhat='dark'\nwhere='lidar'\nwehn=2", r"^fault\[0\]\.wehn: 'dark' takes"),
         ("[[fault]]\nwhat='stamp_jump'\nwhere='lidar'\nby_ms=nan", r"^fault\[0\]\.by_ms: expected a int"),
         ("[[fault]]\nwhat='delayed'\nwhere='lidar'\nby_s=nan", r"^fault\[0\]\.by_s: nan is outside"),
-        ("[[faults]]\nwhat='dark'", r"^faults: a schedule holds \[\[fault\]\] tables"),
+        ("[[faults]]\nwhat='dark'", r"^faults: a schedule must have only \[\[fault\]\] tables"),
         ("fault = 3", r"^fault: expected \[\[fault\]\] tables"),
         ("[[fault]\n", r"^schedule: not TOML"),
     ],
@@ -254,7 +257,7 @@ def test_live_orders() -> None:
 
 def test_a_device_that_is_not_there() -> None:
     def script(schedule: FaultSchedule, _control: Control, _probe: Probe) -> None:
-        with pytest.raises(FaultError, match="'lidar' is no device here"):
+        with pytest.raises(FaultError, match="'lidar' is not a device here"):
             schedule.order(Fault("hot", "lidar"))
 
     play(script, 0.1)
