@@ -24,7 +24,7 @@ POLL_S: Final = 0.2
 """Period at which the end of a search is looked for over Modbus, s."""
 DONE: Final = {
     CommandCode.SET_POSE: "pose set",  # whether it is right, the state says
-    CommandCode.RESET: "new map begun; stored maps remain",
+    CommandCode.RESET: "new map started; stored maps remain",
     CommandCode.RELOCALISE: "search ended",
     CommandCode.SAVE_MAP: "map saved and read back",
     CommandCode.SWITCH_MAP: "map switched",
