@@ -104,7 +104,7 @@ async def test_orders_of_this_computer(tmp_path: Path, monkeypatch: pytest.Monke
         assert (await lumiloop("relocalise"))[1].startswith("search ended; state ")
         assert (await lumiloop("pause"))[1].startswith("paused: ")
         assert (await lumiloop("resume"))[1].startswith("pause ended; ")
-        assert (await lumiloop("reset"))[1].startswith("new map begun; stored maps remain; state ")
+        assert (await lumiloop("reset"))[1].startswith("new map started; stored maps remain; state ")
         orders = [Order.RELOCALISE, Order.PAUSE, Order.RESUME, Order.RESET]
         assert [command.order for command in robot.commands[1:]] == orders
         assert (await lumiloop("save-map"))[:2][1].startswith("map saved and read back")
