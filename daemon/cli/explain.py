@@ -113,8 +113,9 @@ def _hint(asked: str, everything: Sequence[Entry]) -> str:
         if entry.numbers and kind in (entry.kind, entry.kind.rpartition(" ")[2]):
             return f"add a number, as in: {kind} {entry.numbers[0]}"
     names = {entry.name.lower() for entry in everything}
-    near = [] if asked[-1:].isdigit() else difflib.get_close_matches(asked.lower(), names, n=3, cutoff=0.7)
-    near = near or sorted(name for name in names if _inside(asked.lower(), name))[:3]
+    near = sorted(name for name in names if _inside(asked.lower(), name))[:3]
+    if not near and not asked[-1:].isdigit():
+        near = difflib.get_close_matches(asked.lower(), names, n=3, cutoff=0.7)
     if near:
         return f"did you mean {' or '.join(near)}?"
     kinds = "a key, a state, a fault, a reason, a command, a register, a bit or a port"

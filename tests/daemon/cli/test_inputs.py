@@ -29,7 +29,7 @@ def refuse_to_load(*args: object) -> None:
         (["map", "import", "IN"], "IN"),
         (["replay", "none", "--out", "out"], "none: no such file"),
         (["export", "none", "--tum", "a.tum"], "none: no such file"),
-        (["map", "render", "none", "a.png"], "none: cannot be read"),
+        (["map", "render", "none", "a.png"], "none: cannot read the map"),
     ],
 )
 def test_an_input_that_cannot_be_used_loads_no_kernel(

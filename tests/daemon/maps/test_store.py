@@ -249,7 +249,7 @@ def test_a_map_that_somebody_has_put_there_is_found_by_its_identity(tmp_path: Pa
     store = Store(tmp_path)
     assert {store.identity(one) for one in store.generations()} == {MAP, -1}
     assert store.load_map(MAP).stored.meta.map_id == MAP
-    with pytest.raises(Foreign, match="there is no map 00000077"):
+    with pytest.raises(Foreign, match="no map 00000077"):
         store.load_map(0x77)
 
 
