@@ -30,7 +30,7 @@ def test_command_serves_takes_orders_and_ends(tmp_path: Path) -> None:
     with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert [process.stdout.readline() for _ in range(3)] == [
-            f"1 faults of {faults} ordered\n",
+            f"1 faults of {faults} scheduled\n",
             f"UTM-30LX on {link}\n",
             f"fault commands on {control}\n",
         ]
