@@ -45,7 +45,7 @@ from daemon.recording.state_schema import (
 from estimator import State
 
 MOST_NODES: Final = 4_000_000
-"""Largest number of nodes; the state of a map of 10000 submaps has some 500000."""
+"""Largest number of nodes; the state of a map of 10000 submaps has a million."""
 DEEPEST: Final = 100
 """Deepest nesting of tuples in one another."""
 MOST_WITHIN: Final = 1000

@@ -4,7 +4,8 @@
 CRC-32 of all that (u32). Then follow blocks, each with the length of its content (u32), CRC-32 of that (u32), and the
 deflated content. The first block contains the bytes of the lidar line that the codec needs, as records. Each of the
 others contains a msgpack array of nodes as `daemon.recording.state_schema` defines them, by number. The last entry is
-an `End`. The inflated blocks have at most :data:`MOST_BYTES` in all.
+an `End`. The inflated blocks have at most :data:`MOST_BYTES` in all, each :data:`MOST_BLOCK`, and the nodes
+:data:`MOST_VALUES`: a value of one byte takes 50 in memory.
 """
 
 from __future__ import annotations
@@ -20,13 +21,18 @@ from typing import Any, Final
 
 import msgspec
 
-from daemon.recording.state_schema import VERSION, Array, Blob, End, Node
+from daemon.recording.state_schema import VERSION, Array, Blob, End, Node, count_of
 from daemon.system.atomic_file import sync_folder
+from daemon.system.regular_file import read_regular
 
 MAGIC: Final = b"LUMISTAT"
 BLOCK_BYTES: Final = 256 << 10
 MOST_BYTES: Final = 1 << 29
 """Limit of the inflated content, bytes; a ring of the flight recorder is not larger either."""
+MOST_BLOCK: Final = 1 << 26
+"""Limit of one inflated block, bytes: :data:`BLOCK_BYTES` and the largest node."""
+MOST_VALUES: Final = 8_000_000
+"""Limit of the values within nodes; the state of a map of 10000 submaps has 2.4 million."""
 _START: Final = struct.Struct("<8sHI")
 _BLOCK: Final = struct.Struct("<II")
 _CRC: Final = struct.Struct("<I")
@@ -118,7 +124,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], bytes, Iterator[Node]]:
     Raises:
         OSError: it cannot be read. BadState: it is damaged. OtherVersion: of another version.
     """
-    data = path.read_bytes()
+    data = read_regular(path, MOST_BYTES)
     header, at = _header(path, data)
     plain = _plain(path, data, at)
     line = next(plain, None)
@@ -160,7 +166,7 @@ def _plain(path: Path, data: bytes, at: int) -> Iterator[bytes]:
         content = data[at : at + length]
         if len(content) < length or zlib.crc32(content) != crc:
             raise BadState(f"{path.name}: damaged")
-        plain = _inflated(path, content, left)
+        plain = _inflated(path, content, min(left, MOST_BLOCK))
         left -= len(plain)
         yield plain
         at += length
@@ -173,12 +179,12 @@ def _inflated(path: Path, content: bytes, most: int) -> bytes:
     except zlib.error as error:
         raise BadState(f"{path.name}: damaged: {error}") from error
     if len(plain) > most:
-        raise BadState(f"{path.name}: more than {MOST_BYTES >> 20} MB when inflated")
+        raise BadState(f"{path.name}: larger when inflated than any state")
     return plain
 
 
 def _nodes(path: Path, plain: Iterator[bytes]) -> Iterator[Node]:
-    count, ended = 0, False
+    count, left, ended = 0, MOST_VALUES, False
     for content in plain:
         try:
             entries = _decode(content)
@@ -189,8 +195,11 @@ def _nodes(path: Path, plain: Iterator[bytes]) -> Iterator[Node]:
                 raise BadState(f"{path.name}: damaged")
             if isinstance(entry, End):
                 ended = True
-            else:
-                count += 1
-                yield entry
+                continue
+            count += 1
+            left -= count_of(entry)
+            if left < 0:
+                raise BadState(f"{path.name}: more than {MOST_VALUES} values")
+            yield entry
     if not ended:
         raise BadState(f"{path.name}: torn")

@@ -143,6 +143,24 @@ class End(msgspec.Struct, array_like=True, tag="end", frozen=True):
 Node = Kind | Record | Array | Blob | Many | Table | Member | Call
 
 
+def count_of(node: Node) -> int:
+    """Number of values within a node, each of which takes memory however few bytes it has in the file."""
+    match node:
+        case Kind():
+            return len(node.fields)
+        case Record():
+            return len(node.values)
+        case Array():
+            return len(node.shape)
+        case Many():
+            return len(node.items)
+        case Table():
+            return len(node.keys) + len(node.values)
+        case Call():
+            return len(node.given or ())
+    return 0
+
+
 def name_of(what: type | FunctionType) -> str:
     """Returns the name of a class or function in a state.
 

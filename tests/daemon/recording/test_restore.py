@@ -249,7 +249,7 @@ def test_a_file_that_inflates_to_more_than_any_state_is_refused(
 ) -> None:
     monkeypatch.setattr(state_file, "MOST_BYTES", 1 << 20)
     nodes: list[Node] = [Array("u1", (400_000,), "C", bytes(400_000)) for _ in range(3)]
-    with pytest.raises(BadState, match="more than 1 MB"):
+    with pytest.raises(BadState, match="larger when inflated"):
         list(read_state(written(tmp_path / "a", nodes))[2])
 
 
@@ -271,6 +271,9 @@ except (CannotRestore, state_file.BadState) as error:
 """
 
 
+LONG_LIST = "(b'\\x94\\xa4many\\xa4list\\xdd' + struct.pack('>I', 60 << 20) + bytes(60 << 20) + b'\\xc0')"
+
+
 @pytest.mark.parametrize(
     ("content", "blocks"),
     [
@@ -278,6 +281,8 @@ except (CannotRestore, state_file.BadState) as error:
         ("b'\\xdd' + struct.pack('>I', (1 << 32) - 1)", 1),  # an array of 4e9 nodes, as it says
         ("b'\\x91' * (1 << 20)", 1),  # nested without end
         ("b'\\x91\\x94\\xa4many\\xa4list\\xdd' + struct.pack('>I', 1 << 28) + bytes(1 << 20)", 1),
+        (f"b'\\x91' + {LONG_LIST}", 8),
+        (f"b'\\xdc\\x00\\x3c' + 60 * ({LONG_LIST.replace('60', '1')})", 8),
         ("b'\\x91\\x95\\xa5array\\xa2f8\\x91\\xcf' + struct.pack('>Q', 1 << 60) + b'\\xa1C\\xc4\\x00'", 1),
     ],
 )
