@@ -97,7 +97,10 @@ def read(path: Path) -> Remembered | None:
         log.warning("%s cannot be read: %s; the daemon searches the whole map for the pose", path, error.strerror)
         return None
     slots = [unpacked(content[at : at + _SLOT_BYTES]) for at in (0, _SLOT_BYTES)]
-    return max((slot for slot in slots if slot is not None), key=lambda slot: slot.number, default=None)
+    good = [slot for slot in slots if slot is not None]
+    if content and not good:
+        log.warning("%s is damaged; the robot is looked for in the whole map", path)
+    return max(good, key=lambda slot: slot.number, default=None)
 
 
 def _may_write(folder: Path) -> bool:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -22,6 +23,8 @@ from msgspec.structs import replace
 
 from daemon.system.atomic_file import write_whole
 from daemon.system.regular_file import read_regular
+
+log = logging.getLogger(__name__)
 
 NAME: Final = "starts"
 """Name of the JSON file with the counts, in the folder of maps."""
@@ -76,7 +79,11 @@ class StartTrial:
         boot = _boot()
         try:
             before = msgspec.convert(json.loads(read_regular(self._path, MOST_BYTES)), StartAttempts)
-        except (OSError, ValueError, RecursionError):  # ValueError: not JSON, or other values than declared
+        except FileNotFoundError:
+            before = StartAttempts()
+        except (OSError, ValueError, RecursionError) as error:  # ValueError: not JSON, or other values than declared
+            wrong = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else "is damaged"
+            log.warning("%s %s; the starts are counted anew", self._path, wrong)
             before = StartAttempts()
         self._told = before if before.boot == boot else StartAttempts(boot)
         self.out = self._told.out

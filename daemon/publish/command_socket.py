@@ -14,7 +14,7 @@ from typing import Final
 
 from daemon.publish.command_messages import LONGEST_REQUEST, BadRequest, reply_line, request_of
 from daemon.publish.commands import OnEnd
-from daemon.publish.local_socket import listening
+from daemon.publish.local_socket import listening, serve
 from daemon.publish.modbus.holding import CommandCode, Outcome, Request
 from daemon.snapshot import GUESSED, Snapshot
 from hal.net.fair_share import Share
@@ -60,16 +60,8 @@ class CommandSocket:
 
     async def run(self) -> None:
         """Serve until cancelled; raises `DeviceRefused` where another program serves it, or it cannot be made."""
-        loop = asyncio.get_running_loop()
         with listening("command socket", self.path, MODE, CLIENTS) as sock:
-            server = await loop.create_unix_server(lambda: Client(self), sock=sock, backlog=CLIENTS)
-            try:
-                await asyncio.Event().wait()
-            finally:
-                server.close()
-                for client in list(self.clients):
-                    client.drop()
-                self.path.unlink(missing_ok=True)
+            await serve(sock, CLIENTS, lambda: Client(self), self.clients)
 
     def admit(self, client: Client) -> None:
         """Accept a connection; the oldest one makes room for it."""

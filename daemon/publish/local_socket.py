@@ -1,16 +1,30 @@
-"""Listening unix sockets of the daemon: binding with the right permissions, and removal of a dead program's file."""
+"""Unix sockets that the daemon serves: binding with the right permissions, and removal of a dead program's file."""
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import socket
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol
 
 from hal.errors import DeviceRefused
 
 
-def listening(what: str, path: Path, mode: int, backlog: int) -> socket.socket:
-    """A listening socket at a path, whose folder is created; the socket file of a dead program is removed first.
+class Client(Protocol):
+    """One connection."""
+
+    def drop(self) -> None:
+        """Close it at once."""
+
+
+@contextmanager
+def listening(what: str, path: Path, mode: int, backlog: int) -> Iterator[socket.socket]:
+    """A listening socket at a path, whose folder is created; the file of a dead program is removed first.
+
+    The file is removed at the end.
 
     Args:
         what: name of the service, for errors.
@@ -22,11 +36,29 @@ def listening(what: str, path: Path, mode: int, backlog: int) -> socket.socket:
         DeviceRefused: another program serves it, or it cannot be made.
     """
     try:
-        return _bound(what, path, mode, backlog)
+        sock = _bound(what, path, mode, backlog)
     except OSError as error:
         problem = error.strerror or str(error)
         remedy = "free the path, or give write access to its folder"
         raise DeviceRefused(f"{what} {path}", problem, remedy) from None
+    with sock:
+        try:
+            yield sock
+        finally:
+            path.unlink(missing_ok=True)
+
+
+async def serve(
+    sock: socket.socket, backlog: int, made: Callable[[], asyncio.BaseProtocol], clients: Iterable[Client]
+) -> None:
+    """Serve a listening socket until cancelled, then close all connections."""
+    server = await asyncio.get_running_loop().create_unix_server(made, sock=sock, backlog=backlog)
+    try:
+        await asyncio.Event().wait()
+    finally:
+        server.close()
+        for client in list(clients):
+            client.drop()
 
 
 def _bound(what: str, path: Path, mode: int, backlog: int) -> socket.socket:

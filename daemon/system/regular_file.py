@@ -1,6 +1,7 @@
 """Reading of files that may be anything: bounded in size, tried again after a failure, and without waiting for a FIFO.
 
-A start reads its files with this. A read that fails once, as on a worn memory card, does not end it.
+A start reads its files with this, and an import those of others. A read that fails once, as on a worn memory card,
+does not end it.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ LASTING: Final = frozenset(
 """Errors that another try does not change."""
 OPEN_ALREADY: Final = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/")
 """Paths of what the caller has opened, as a shell does for ``<(command)``: a pipe is welcome there."""
+_KINDS: Final = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
 
 
 def read_regular(path: Path, most_bytes: int) -> bytes:
     """Content of a regular file of at most ``most_bytes``.
 
     Raises:
-        OSError: it cannot be read, is no regular file, or is larger.
+        OSError: it cannot be read, is not a regular file, or is larger.
     """
     for _ in range(TRIES - 1):
         try:
@@ -52,13 +54,11 @@ def read_named(path: Path, most_bytes: int) -> bytes:
 
 
 def _read(path: Path, most_bytes: int) -> bytes:
+    _must_be_regular(path, path.stat().st_mode)  # before it is opened, which may start a device
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:
         about = os.fstat(handle)
-        if stat.S_ISDIR(about.st_mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        if not stat.S_ISREG(about.st_mode):
-            raise OSError(errno.EINVAL, f"it is {_kind_of(about.st_mode)}, not a regular file", str(path))
+        _must_be_regular(path, about.st_mode)
         with os.fdopen(handle, "rb", closefd=False) as file:
             content = b"" if about.st_size > most_bytes else file.read(most_bytes + 1)
     finally:
@@ -66,11 +66,16 @@ def _read(path: Path, most_bytes: int) -> bytes:
     return _bounded(path, content, max(about.st_size, len(content)), most_bytes)
 
 
+def _must_be_regular(path: Path, mode: int) -> None:
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(
+            errno.EINVAL, f"it is {_KINDS.get(stat.S_IFMT(mode), 'a device')}, not a regular file", str(path)
+        )
+
+
 def _bounded(path: Path, content: bytes, size: int, most_bytes: int) -> bytes:
     if size > most_bytes:
         raise OSError(errno.EFBIG, f"it is larger than {most_bytes} bytes", str(path))
     return content
-
-
-def _kind_of(mode: int) -> str:
-    return "a FIFO" if stat.S_ISFIFO(mode) else "a device"

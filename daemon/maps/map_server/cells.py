@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 from typing import Final
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from daemon.maps.map_server.description import BadMapServer, Description, describe
 from daemon.maps.map_server.picture import read_picture
 from daemon.maps.map_server.pixels import BadPicture, Picture
-from daemon.system.bounded_file import FileRefused, read_regular
+from daemon.system.regular_file import read_regular
 
 Trinary = npt.NDArray[np.int8]
 """(rows, columns), row 0 at the bottom: 1 occupied, 0 free, -1 unknown."""
@@ -36,8 +37,6 @@ def load(path: Path) -> tuple[Description, Trinary]:
     """
     try:
         text = read_regular(path, MOST_TEXT).decode()
-    except FileRefused as error:
-        raise BadMapServer(f"{path}: {error}; name map_server's YAML file") from error
     except OSError as error:
         raise BadMapServer(f"{path}: cannot be read: {error.strerror}; name map_server's YAML file") from error
     except UnicodeDecodeError as error:
@@ -48,8 +47,6 @@ def load(path: Path) -> tuple[Description, Trinary]:
     except OSError as error:
         wrong = f"the image {described.image} cannot be read: {error.strerror}"
         raise BadMapServer(f"{path}: {wrong}; copy it there, or correct `image`") from error
-    except FileRefused as error:
-        raise BadMapServer(f"{path}: the image {described.image} {error}; correct `image`") from error
     except BadPicture as error:
         raise BadMapServer(f"{described.image}: {error}") from error
     return described, cells_of(described, picture)
@@ -59,8 +56,8 @@ def _within(path: Path, image: Path) -> Path:
     """The image's path without links.
 
     Raises:
-        FileRefused: a link leads out of the folder of the YAML file, or of the image if that is named elsewhere.
-        OSError: there is no such file.
+        OSError: there is no such file, or a link leads out of the folder of the YAML file (of the image if that is
+            named elsewhere).
     """
     folder = path.parent.resolve()
     relative = Path(os.path.relpath(image, path.parent))
@@ -70,9 +67,9 @@ def _within(path: Path, image: Path) -> Path:
     try:
         found = named.resolve(strict=True)
     except RuntimeError:
-        raise FileRefused("is a link that leads to itself") from None
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(named)) from None
     if not found.is_relative_to(base):
-        raise FileRefused(f"is a link to {found} outside its folder; copy the file instead")
+        raise OSError(errno.EXDEV, f"it is a link out of its folder, to {found}", str(named))
     return found
 
 

@@ -8,7 +8,6 @@ No call waits for a client, and without clients nothing is encoded: a tap that h
 
 from __future__ import annotations
 
-import asyncio
 import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -18,7 +17,7 @@ import msgspec
 import numpy as np
 
 from daemon.maps.tiles import NOTHING_SHOWN, RESOLUTION_M, MapTiles
-from daemon.publish.local_socket import listening
+from daemon.publish.local_socket import listening, serve
 from daemon.publish.stream.session import CLIENTS, LATEST, ONCE, RAW, SCHEMA, TOPICS, Client, encode, framed
 from daemon.snapshot import Snapshot
 from hal.adc import RawSamples
@@ -101,15 +100,8 @@ class StreamServer:
             DeviceRefused: another program serves it, or it cannot be made.
         """
         # every user may connect, because the stream is read-only; the folder's permissions limit access
-        sock = listening("stream", self.path, 0o666, CLIENTS)
-        server = await asyncio.get_running_loop().create_unix_server(lambda: Client(self), sock=sock)
-        try:
-            await asyncio.Event().wait()
-        finally:
-            server.close()
-            for client in list(self.clients):
-                client.drop()
-            self.path.unlink(missing_ok=True)
+        with listening("stream", self.path, 0o666, CLIENTS) as sock:
+            await serve(sock, CLIENTS, lambda: Client(self), self.clients)
 
     def hello(self) -> dict[str, object]:
         """First message to a client."""

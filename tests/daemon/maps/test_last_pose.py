@@ -69,7 +69,7 @@ def test_a_pose_that_was_lost_is_forgotten_and_one_that_is_being_found_again_is_
     assert kept(tmp_path, at(0.0, 3.5), at(1.0, 0.0, State.NO_LIDAR)).of_map(7) == (3.5, 2.0, 0.5)
 
 
-def test_a_slot_that_is_half_written_leaves_the_one_before(tmp_path: Path) -> None:
+def test_a_slot_that_is_half_written_leaves_the_one_before(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     first, second = Remembered(7, (1.0, 0.0, 0.0), 1.7e9, 4), Remembered(7, (2.0, 0.0, 0.0), 1.7e9, 5)
     file = tmp_path / FILE
     for cut in range(64):
@@ -80,8 +80,10 @@ def test_a_slot_that_is_half_written_leaves_the_one_before(tmp_path: Path) -> No
         assert found.number == 5 or found == first
     file.write_bytes(packed(first) + packed(second))
     assert read(file) == second
+    assert not caplog.text
     file.write_bytes(packed(first)[:30])
     assert read(file) is None
+    assert caplog.messages == [f"{file} is damaged; the robot is looked for in the whole map"]
 
 
 @given(content=st.binary(max_size=200))

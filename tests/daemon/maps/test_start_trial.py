@@ -212,19 +212,21 @@ def test_another_run_of_the_computer_counts_anew(tmp_path: Path, monkeypatch: py
     ],
     ids=lambda held: repr(held[:40]),
 )
-def test_a_count_that_cannot_be_read_is_none(tmp_path: Path, held: bytes) -> None:
+def test_a_count_that_cannot_be_read_is_none(tmp_path: Path, held: bytes, caplog: pytest.LogCaptureFixture) -> None:
     store_with(tmp_path, 1).close()
     (tmp_path / NAME).write_bytes(held.replace(b"BOOT", BOOT.read_bytes().strip()))
     before = names(tmp_path)
     assert begin(tmp_path, lasts=True) is not None
     assert names(tmp_path) == before
+    assert caplog.text.count(f"{tmp_path / NAME} ") == (held != b"{}")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_count_that_is_no_regular_file_is_none(tmp_path: Path, kind: str) -> None:
+def test_a_count_that_is_no_regular_file_is_none(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
     store_with(tmp_path, 1).close()
     planted(tmp_path / NAME, kind)
     assert begin(tmp_path) is not None
+    assert caplog.text.count(f"{tmp_path / NAME} cannot be read") == 1
 
 
 def test_a_map_whose_name_is_no_text_is_left_out_like_any_other(

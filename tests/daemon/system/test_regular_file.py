@@ -36,6 +36,8 @@ def test_a_file_that_is_too_large_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="larger than 100 bytes"):
         read_regular(file, 100)
     assert read_regular(file, 101) == bytes(101)
+    with pytest.raises(OSError, match="larger than 10 bytes"):
+        read_regular(Path("/proc/self/status"), 10)  # a file that states no size
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.EACCES, errno.EMFILE, errno.ENOMEM, errno.ENOSPC])
@@ -58,9 +60,11 @@ def test_a_failure_that_lasts_is_raised(tmp_path: Path, monkeypatch: pytest.Monk
     def fails(path: Path, flags: int) -> int:
         raise OSError(errno.EIO, "gone", str(path))
 
+    file = tmp_path / "file"
+    file.touch()
     monkeypatch.setattr(os, "open", fails)
     with pytest.raises(OSError, match="gone"):
-        read_regular(tmp_path / "file", 100)
+        read_regular(file, 100)
 
 
 def test_a_pipe_that_the_shell_has_opened_is_welcome_and_bounded() -> None:
