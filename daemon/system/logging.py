@@ -7,7 +7,9 @@ import math
 import os
 import socket
 import sys
-from collections.abc import Mapping
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Final
@@ -22,6 +24,11 @@ PRIORITY: Final = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, lo
 """Priority of syslog(3), by level."""
 LONGEST: Final = 32_768
 """Longest message in bytes: it has to fit into one datagram."""
+
+LIBRARY_LINES: Final = 10
+LIBRARY_S: Final = 10.0
+"""Most lines of one other package's logger in an interval of this length, s."""
+LEFT_OUT: Final = " (%d more such lines were skipped before it)"
 
 Fields = Mapping[str, object]
 
@@ -47,7 +54,36 @@ class Sparing:
             return
         more, self._left_out = self._left_out, 0
         self._told += 1
-        self._log.log(level, "%s%s", text, f" ({more} more such lines were skipped before it)" if more else "")
+        self._log.log(level, "%s%s", text, LEFT_OUT % more if more else "")
+
+
+class LibraryLimit(logging.Filter):
+    """Filter of a log handler: lines of other packages, whose rate a client may control; suppressed ones are counted.
+
+    Args:
+        now: monotonic time, s.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._now = now
+        self._until, self._told, self._left_out = -math.inf, Counter[str](), Counter[str]()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return False for a line that is left out."""
+        name = record.name
+        if name.partition(".")[0] in OURS or record.exc_info:
+            return True
+        if self._now() >= self._until:
+            self._until = self._now() + LIBRARY_S
+            self._told.clear()
+        if self._told[name] == LIBRARY_LINES:
+            self._left_out[name] += 1
+            return False
+        self._told[name] += 1
+        if more := self._left_out.pop(name, 0):
+            record.msg, record.args = f"%s{LEFT_OUT}", (record.getMessage(), more)
+        return True
 
 
 class _ZonedTime(logging.Formatter):
@@ -77,7 +113,7 @@ def start_log() -> None:
         handler = JournalHandler(JOURNAL, handler)
         handler.setFormatter(logging.Formatter("%(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
-    limit_tracebacks(handler)
+    _limit(handler)
 
 
 def start_command_log() -> None:
@@ -85,6 +121,11 @@ def start_command_log() -> None:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("lumiloop: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    _limit(handler)
+
+
+def _limit(handler: logging.Handler) -> None:
+    handler.addFilter(LibraryLimit())
     limit_tracebacks(handler)
 
 

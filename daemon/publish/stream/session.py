@@ -216,8 +216,10 @@ class Client(asyncio.Protocol):
             self._server.show(self)
 
     def tell(self, topic: str, body: bytes) -> None:
-        """Send a message, or queue it until the client has caught up."""
-        if self._stuck is None and self._transport is not None:
+        """Send a message, or queue it until the client has caught up; nothing where it has gone."""
+        if self._transport is None or self._transport.is_closing():
+            return
+        if self._stuck is None:
             head = encode({"topic": topic, "replaced": self.replaced})
             # a map of three entries with the encoded data inserted: encoded once for all clients
             joined = b"\x83" + head[1:] + b"\xa4data" + body

@@ -174,3 +174,20 @@ def test_lines_of_a_terminal_have_date_time_and_zone(monkeypatch: pytest.MonkeyP
     record = logging.LogRecord("daemon.part", logging.INFO, "file", 1, "said", (), None)
     made[0].handle(record)
     assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}[+-]\d\d:\d\d INFO    said\n", stream.getvalue())
+
+
+def test_lines_of_a_library_cannot_fill_the_log_and_ours_are_all_there() -> None:
+    """A client provokes them: a WebSocket library has a line for each message that it cannot read."""
+    clock, stream = [0.0], io.StringIO()
+    handler = logging.StreamHandler(stream)
+    handler.addFilter(system_logging.LibraryLimit(lambda: clock[0]))
+    for name in ("library.server", "daemon.health.state_log"):
+        logger = logging.Logger(name)
+        logger.addHandler(handler)
+        for number in range(1000):
+            clock[0] = 0.1 * number
+            logger.warning("%s: message %d", name, number)
+    lines = stream.getvalue().splitlines()
+    assert sum("daemon" in line for line in lines) == 1000
+    assert 90 <= sum("library" in line for line in lines) <= 110
+    assert "library.server: message 100 (90 more such lines were left out before it)" in lines

@@ -212,6 +212,18 @@ async def test_a_bad_request_is_told_and_ends_the_client_only(
         assert (await good.frame())["topic"] == "pose"
 
 
+async def test_who_has_gone_is_sent_nothing_more(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """It has hung up, which the event loop is going to tell; asyncio would warn of each further message."""
+    async with running(tmp_path / "stream") as server:
+        tap = await wanting(server, "scan")
+        tap.writer.transport.abort()
+        await asyncio.sleep(0)
+        for number in range(20):
+            server.on_scan(raw_scan(number))
+        await until(lambda: not server.clients)
+    assert caplog.text == ""
+
+
 async def test_an_unknown_topic_is_named(tmp_path: Path) -> None:
     async with running(tmp_path / "stream") as server:
         tap = await connected(server)
