@@ -114,6 +114,10 @@ fuzz: venv  ## damaged bytes to every parser, a tenth of the full size, and new 
 	$(BIN)/python -m pytest -q tests/fuzz/test_parsers.py -m "not slow" $(ARGS) $(NONE)
 	$(BIN)/python -m pytest -q -n auto --dist loadfile --hypothesis-profile=search -m "$(QUICK)" $(PROPERTIES) $(ARGS) $(NONE)
 
+.PHONY: fuzz-together
+fuzz-together: venv  ## a minute of damage at every port, socket and line of the real processes at once (ARGS="600": ten)
+	$(RUN) -m tests.fuzz.together $(ARGS)
+
 slowest: venv  ## the slowest tests of `make test`, and why they are slow (ARGS="tests/daemon")
 	$(BIN)/python -m pytest -q -n auto --dist loadfile -p tools.ci.slowest -m "$(QUICK)" $(ARGS)
 
