@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.power.__main__ import Recording, cut
+from tests.faults.power.disk import Recording, cut
 from tests.faults.power.logged_disk import HEADER, Entry, entries
 
 NEEDED = ("unshare", "losetup", "mkfs.ext4", "mount", "umount")
@@ -32,6 +32,7 @@ def test_a_power_cut_at_any_write_leaves_a_start_the_map_and_a_version() -> None
     found = json.loads(done.stdout)
     assert found["wrong"] == []
     assert found["started"] == QUICK_CUTS
+    assert found["daemons"] == QUICK_CUTS // 10
     assert found["flushes"] > 100
     assert set(found["cuts"]) >= {"start", "save", "upgrade"}
 

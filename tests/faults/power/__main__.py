@@ -2,7 +2,8 @@
 
 The writes of some starts, saves and one upgrade are recorded once. Each cut keeps what was flushed before it. Of the
 writes since then it keeps all, or some by chance as a disk's cache may, the last one torn between two sectors. The
-image is mounted, which plays its journal; the program's own start and the installed version are judged on it.
+image is mounted, which plays its journal; the program's own start and the installed version are judged on it. After
+some more cuts the whole daemon is started (:mod:`tests.faults.power.whole_daemon`).
 Prints counts as JSON; needs root, /dev/fuse and loop devices. Mounts are seen by this process alone.
 """
 
@@ -18,77 +19,20 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from tests.faults.power.logged_disk import Entry, entries
+from tests.faults.power import whole_daemon
+from tests.faults.power.disk import Moment, Recording, cut, mounted, place, recorded
 from tests.faults.start_files import prepare, run, sessions_in
 from tests.systemd.installing import SITE, Bench
 
 CUTS: Final = 120
+WHOLE: Final = 10
+"""One in so many cuts more is tried with the whole daemon."""
 DISK_BYTES: Final = 64 << 20
-SECTOR: Final = 512
-OPTIONS: Final = "commit=1"
-"""Of the mount while it is recorded: the journal is written once a second, so that short work has many states."""
-
-
-@dataclass(frozen=True)
-class Moment:
-    """What holds from a place in the log on: phase, number of the latest map that was saved."""
-
-    at: int
-    phase: str
-    saved: int
-
-
-@dataclass
-class Recording:
-    """Writes by their place in the log, the moments, and the file listings of the versions that were in use."""
-
-    log: list[tuple[int, Entry]] = field(default_factory=list)
-    moments: list[Moment] = field(default_factory=list)
-    versions: list[dict[str, bytes]] = field(default_factory=list)
-
-
-def tool(*words: object) -> str:
-    """Run a program of the system."""
-    return subprocess.run([str(word) for word in words], check=True, capture_output=True, text=True).stdout.strip()
-
-
-@contextmanager
-def mounted(disk: Path, folder: Path, options: str) -> Iterator[Path]:
-    """An image as a file system, by a loop device."""
-    device = tool("losetup", "--find", "--show", disk)
-    try:
-        folder.mkdir(exist_ok=True)
-        tool("mount", "-t", "ext4", "-o", options, device, folder)
-        try:
-            yield folder
-        finally:
-            tool("umount", folder)
-    finally:
-        tool("losetup", "--detach", device)
-
-
-@contextmanager
-def logged(image: Path, folder: Path, log: Path) -> Iterator[Path]:
-    """An image as a file whose writes are logged."""
-    folder.mkdir()
-    words = [sys.executable, "-m", "tests.faults.power.logged_disk", str(folder), str(image), str(log)]
-    with subprocess.Popen(words) as server:
-        try:
-            end = time.monotonic() + 20.0
-            while not (folder / "disk").exists():
-                assert server.poll() is None
-                assert time.monotonic() < end
-                time.sleep(0.05)
-            yield folder / "disk"
-        finally:
-            tool("umount", folder)
-            server.wait(20.0)
+MEMORY: Final = "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
 def in_child(work: Callable[[], object]) -> bool:
@@ -132,19 +76,16 @@ def contents(bench: Bench) -> dict[str, bytes]:
 
 def record(work: Path) -> Recording:
     """Record first starts, later ones with their saves, and an upgrade."""
-    made, log = Recording(), work / "log"
-    image = work / "image"
-    with image.open("wb") as file:
-        file.truncate(DISK_BYTES)
-    tool("mkfs.ext4", "-q", "-F", image)
-    with mounted(image, work / "mount", "defaults") as folder:
+    made = Recording()
+
+    def furnished(folder: Path) -> None:
         furnish(folder)
         made.versions.append(contents(bench_in(folder)))
-    shutil.copy(image, work / "base")
-    with logged(image, work / "fuse", log) as disk, mounted(disk, work / "mount", OPTIONS) as folder:
+
+    with recorded(work, DISK_BYTES, furnished, made) as (folder, at):
 
         def phase(name: str) -> None:
-            made.moments.append(Moment(log.stat().st_size, name, max(sessions_in(folder / "robot"))))
+            made.moments.append(Moment(at(), name, max(sessions_in(folder / "robot"))))
 
         for number in range(3):
             shutil.rmtree(folder / "robot/kernels")  # another version's
@@ -162,23 +103,7 @@ def record(work: Path) -> Recording:
         assert in_child(lambda: run(folder / "robot"))
         made.versions.append(contents(bench_in(folder)))
         phase("end")
-    made.log = list(entries(log.read_bytes()))
     return made
-
-
-def cut(made: Recording, base: Path, image: Path, last: int, draw: random.Random, way: int) -> None:
-    """Make the image that a power cut after ``last`` entries leaves; ``way`` 0: all of them, 1: some, 2: torn."""
-    shutil.copy(base, image)
-    done = [entry for _, entry in made.log[:last]]
-    flushed = max((number for number, entry in enumerate(done) if entry.data is None), default=0)
-    kept = [one for number, one in enumerate(done) if number < flushed or way == 0 or draw.random() < 0.5]
-    with image.open("r+b") as file:
-        for number, one in enumerate(kept):
-            data = one.data or b""
-            if way == 2 and number == len(kept) - 1 and number >= flushed:
-                data = data[: SECTOR * draw.randint(0, len(data) // SECTOR)]
-            file.seek(one.offset)
-            file.write(data)
 
 
 def judge(made: Recording, folder: Path, saved: int, after: bool) -> list[str]:
@@ -206,15 +131,14 @@ def main(cuts: int) -> dict[str, object]:
     """Record once, cut often; the counts."""
     logging.disable(logging.CRITICAL)
     draw = random.Random(3)
-    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as name:
+    with tempfile.TemporaryDirectory(dir=MEMORY) as name:
         work = Path(name)
         made = record(work)
         phases, wrong = dict[str, int](), []
         spans = list(zip(made.moments, made.moments[1:], strict=False))
         for number in range(cuts):
             begin, end = spans[-2] if number % 3 == 2 else draw.choice(spans)  # a third of them in the upgrade
-            places = [at for at, (size, _) in enumerate(made.log, 1) if begin.at < size <= end.at]
-            last = draw.choice(places)
+            last = place(made, begin, end, draw)
             cut(made, work / "base", work / "cut", last, draw, number % 4 % 3)
             with mounted(work / "cut", work / "mount", "defaults") as folder:
                 found = judge(made, folder, begin.saved, begin.phase == "after the upgrade")
@@ -222,7 +146,11 @@ def main(cuts: int) -> dict[str, object]:
             wrong += [{"cut": number, "phase": begin.phase, "entry": last, "wrong": found}] if found else []
         writes = sum(entry.data is not None for _, entry in made.log)
         flushes = len(made.log) - writes
-        return {"writes": writes, "flushes": flushes, "cuts": phases, "started": cuts - len(wrong), "wrong": wrong}
+    daemons = cuts // WHOLE
+    with tempfile.TemporaryDirectory(dir=MEMORY) as name:
+        failed = whole_daemon.main(daemons, Path(name))
+    counts = {"writes": writes, "flushes": flushes, "cuts": phases, "started": cuts - len(wrong), "daemons": daemons}
+    return {**counts, "wrong": [*wrong, *failed]}
 
 
 def apart(words: list[str]) -> int:
