@@ -190,4 +190,4 @@ def test_lines_of_a_library_cannot_fill_the_log_and_ours_are_all_there() -> None
     lines = stream.getvalue().splitlines()
     assert sum("daemon" in line for line in lines) == 1000
     assert 90 <= sum("library" in line for line in lines) <= 110
-    assert "library.server: message 100 (90 more such lines were left out before it)" in lines
+    assert "library.server: message 100 (90 more such lines were skipped before it)" in lines
