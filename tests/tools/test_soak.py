@@ -52,6 +52,7 @@ def test_stored_files_are_those_below_the_folder(tmp_path: Path) -> None:
     (tmp_path / "maps" / "one").write_bytes(bytes(1_000_000))
     (tmp_path / "two").write_bytes(bytes(500_000))
     (tmp_path / "link").symlink_to("nowhere")
+    (tmp_path / "another name").hardlink_to(next(path for path in tmp_path.rglob("*") if path.is_file()))
     assert stored(tmp_path) == (2.0, 1.5)
     assert stored(None) == (0.0, 0.0)
 

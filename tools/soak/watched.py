@@ -110,16 +110,19 @@ def growth(counts: Array) -> float:
 
 
 def stored(folder: Path | None) -> tuple[float, float]:
-    """Number of the files below a folder, and their size in MB; a file that goes meanwhile does not count."""
-    count, size = 0, 0
+    """Number of the files below a folder, and their size in MB; a file with several names is one.
+
+    A file that goes meanwhile does not count.
+    """
+    sizes: dict[tuple[int, int], int] = {}
     for path in () if folder is None else folder.rglob("*"):
         try:
             found = path.lstat()
         except OSError:
             continue
         if S_ISREG(found.st_mode):
-            count, size = count + 1, size + found.st_size
-    return float(count), size / 1e6
+            sizes[found.st_dev, found.st_ino] = found.st_size
+    return float(len(sizes)), sum(sizes.values()) / 1e6
 
 
 def process(pid: int) -> tuple[float, float, float]:
