@@ -222,10 +222,19 @@ def robot(folder: Path) -> Iterator[tuple[Attack, Reader, dict[str, int]]]:
     space = dict(os.environ, XDG_STATE_HOME=str(folder / "state"), XDG_RUNTIME_DIR=str(folder / "run"))
     os.environ["XDG_RUNTIME_DIR"] = space["XDG_RUNTIME_DIR"]
     program = [sys.executable, "-m"]
-    sim = ["tools.sim", "--building", "paper_room", "--hold", "--pty", folder / "sensor", "--control", folder / "c"]
+    sim: list[object] = [
+        "tools.sim",
+        "--building",
+        "paper_room",
+        "--hold",
+        "--pty",
+        folder / "sensor",
+        "--control",
+        folder / "c",
+    ]
     sim += ["--odometry", f"udp://127.0.0.1:{ports['odometry']}", "--truth", f"udp://127.0.0.1:{free_port()}"]
     sim += ["--light", f"unix:{folder / BUS}", "--survey", folder / SURVEY]
-    taps = {
+    taps: dict[str, list[object]] = {
         "router": ["fleet", "router", "--listen", router],
         "view": ["view", "--port", ports["view"], "--config", config],
         "metrics": ["metrics", "--listen", f"127.0.0.1:{ports['metrics']}", "--config", config],
