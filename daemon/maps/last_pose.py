@@ -99,7 +99,7 @@ def read(path: Path) -> Remembered | None:
     slots = [unpacked(content[at : at + _SLOT_BYTES]) for at in (0, _SLOT_BYTES)]
     good = [slot for slot in slots if slot is not None]
     if content and not good:
-        log.warning("%s is damaged; the robot is looked for in the whole map", path)
+        log.warning("%s is damaged; the whole map is searched for the robot", path)
     return max(good, key=lambda slot: slot.number, default=None)
 
 

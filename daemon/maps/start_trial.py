@@ -83,7 +83,7 @@ class StartTrial:
             before = StartAttempts()
         except (OSError, ValueError, RecursionError) as error:  # ValueError: not JSON, or other values than declared
             wrong = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else "is damaged"
-            log.warning("%s %s; the starts are counted anew", self._path, wrong)
+            log.warning("%s %s; the count of starts begins at zero", self._path, wrong)
             before = StartAttempts()
         self._told = before if before.boot == boot else StartAttempts(boot)
         self.out = self._told.out

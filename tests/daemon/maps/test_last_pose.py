@@ -83,7 +83,7 @@ def test_a_slot_that_is_half_written_leaves_the_one_before(tmp_path: Path, caplo
     assert not caplog.text
     file.write_bytes(packed(first)[:30])
     assert read(file) is None
-    assert caplog.messages == [f"{file} is damaged; the robot is looked for in the whole map"]
+    assert caplog.messages == [f"{file} is damaged; the whole map is searched for the robot"]
 
 
 @given(content=st.binary(max_size=200))

@@ -45,7 +45,7 @@ def test_only_files_are_read(folder: Path, kind: str, linked: bool) -> None:
         (folder / "link").symlink_to("it")
     name = "link" if linked else "it"
     begun = time.monotonic()
-    with pytest.raises(BadMapServer, match=rf"floor.yaml: the image \S*/{name} cannot be read: {WRONG}; correct"):
+    with pytest.raises(BadMapServer, match=rf"floor.yaml: the image \S*/{name} cannot be read: {WRONG}; copy it"):
         load(described(folder, name))
     with pytest.raises(BadMapServer, match=f"{name}: cannot be read: {WRONG}; name map_server's YAML file"):
         load(folder / name)
