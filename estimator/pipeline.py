@@ -60,7 +60,7 @@ from estimator.relocalisation import (
     unaligned_map,
 )
 from estimator.result import LightsResult, MatchResult, Reason, StepResult
-from estimator.scan_matching import scan_matcher
+from estimator.scan_matching import scan_matcher, scan_validation
 from estimator.scan_matching.deskew import ScanPoints, oriented, points_of, unturned
 from estimator.scan_matching.scan_matcher import Asked, Prior, View
 from estimator.scan_matching.scan_validation import in_time, nothing_of, refused
@@ -237,6 +237,7 @@ def predict(state: State, record: Record) -> None:
         case Odometry():
             motion_model.on_odometry(state.motion, wheel_calibration.corrected(state.wheels, record), noise)
             wheel_calibration.on_odometry(state.wheels, record)
+            scan_validation.on_odometry(state.matching, record)
             time_offset.on_odometry(state.time_offset, record)
             kidnap_detection.on_odometry(state, record)
         case Imu():

@@ -34,6 +34,7 @@ class Reason(Enum):
     TOO_FEW_PAIRS = "too few beams have a correspondence in the map"
     NO_MAP = "the local map is still empty"
     REJECTED = "residual or correction implausible"
+    REPEATED = "the same scan again although the robot has moved"
     MALFORMED = "not a valid scan: lengths, bearings, times, mount or noise are impossible"
     LATE = "older than the previous scan, or than the motion history"
     PASSED_OVER = "not matched: no computing time left, or paused"

@@ -27,8 +27,8 @@ FEW: Final = 2
 REPLAYED: Final = frozenset(
     (
         *(Fault.NO_LAMPS, Fault.SURVEY_CONTRADICTED, Fault.TWIN_LAMPS, Fault.LAMP_MOVED, Fault.LAMP_DEAD),
-        *(Fault.LIDAR_MISFIT, Fault.LIDAR_TURNED, Fault.ODOMETRY_SILENT, Fault.ODOMETRY_DISAGREES),
-        *(Fault.ODOMETRY_SCALE, Fault.PROTECTION_ALERT),
+        *(Fault.LIDAR_MISFIT, Fault.LIDAR_TURNED, Fault.LIDAR_FROZEN, Fault.ODOMETRY_SILENT),
+        *(Fault.ODOMETRY_DISAGREES, Fault.ODOMETRY_SCALE, Fault.PROTECTION_ALERT),
     )
 )
 """Faults that follow from the data alone, so that a replay reproduces them. All others come from drivers or from the
@@ -42,8 +42,9 @@ class Vitals:
     Attributes:
         link, error: of the lidar driver. silent: no valid scan for three scan periods.
         scans, missed, invalid: the driver's counters. period: scan period in seconds.
-        late: counter of scans that arrived late. lag: time offset in s of the scan stamps behind the odometry, 0: not
-            available. misfit: scans are inconsistent with the map.
+        late: counter of scans that arrived late. repeated: of those equal to an earlier one while the robot moves.
+        lag: time offset in s of the scan stamps behind the odometry, 0: not available. misfit: scans are inconsistent
+            with the map.
         slow: lasting errors of odometry and lidar mount, None while none is large.
         odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the lidar.
         readings, readings_missed, readings_old: counters of odometry readings that arrived, were lost, and arrived
@@ -71,6 +72,7 @@ class Vitals:
     odometry_jumps: int = 0
     disagree: bool = False
     late: int = 0
+    repeated: int = 0
     misfit: bool = False
     lag: float = 0.0
     slow: SlowErrors | None = None
@@ -177,6 +179,8 @@ def _lidar(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.LIDAR_GAPS
     if now.late - before.late > FEW + 0.05 * scans or (now.lag > 0.0 and not down):
         yield Fault.LIDAR_LATE
+    if now.repeated - before.repeated > FEW:
+        yield Fault.LIDAR_FROZEN
     if now.misfit:
         yield Fault.LIDAR_MISFIT
     if now.slow is not None and now.slow.mount:

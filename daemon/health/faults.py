@@ -19,6 +19,7 @@ class Fault(IntEnum):
     LIDAR_LATE = 107
     LIDAR_MISFIT = 108
     LIDAR_TURNED = 109
+    LIDAR_FROZEN = 110
     ADC_BUS_MISSING = 151
     ADC_BUS_REFUSED = 152
     ADC_MISSING = 153
@@ -89,6 +90,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.LIDAR_TURNED: (
         "the lidar is not mounted as configured",
         "measure the mount, or record a drive and run `lumiloop calibrate --lidar-mount`; then correct `lidar.mount`",
+    ),
+    Fault.LIDAR_FROZEN: (
+        "the lidar repeats one scan while the robot moves; odometry and light carry the pose",
+        "power it off and on; check what relays its scans, if something does",
     ),
     Fault.ADC_BUS_MISSING: (
         "the photodiode's I2C bus is not found",

@@ -12,6 +12,8 @@ from daemon.health.reasons import Reason
 from daemon.integrity.arrival_monitor import ODOMETRY_SILENT_S
 from daemon.integrity.state_memory import Memory
 from daemon.snapshot import State
+from estimator import MatchResult
+from estimator import Reason as MatchReason
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
 
@@ -36,13 +38,13 @@ class Watch:
     """Monitors arrivals and the state machine's results.
 
     Attributes:
-        late: scans that arrived late so far. readings, missed, old: odometry readings that arrived, were lost on the
-            network, and arrived late.
+        late: scans that arrived late so far. repeated: that repeat an earlier one while the robot moves.
+        readings, missed, old: odometry readings that arrived, were lost on the network, and arrived late.
         misfit: the lidar is inconsistent with the map. disagree: it is inconsistent with the odometry.
     """
 
     def __init__(self) -> None:
-        self.late = self.readings = self.missed = self.old = 0
+        self.late = self.repeated = self.readings = self.missed = self.old = 0
         self.misfit = self.disagree = False
         self._t_reading: float | None = None
         self._known = False
@@ -53,6 +55,10 @@ class Watch:
     def on_scan(self, scan: RawScan, period: float) -> None:
         """Register a received scan."""
         self.late += scan.t_rx - scan.t_mono > LATE_PERIODS * period
+
+    def on_match(self, match: MatchResult | None) -> None:
+        """Register a scan that has been matched or refused."""
+        self.repeated += match is not None and match.reason is MatchReason.REPEATED
 
     def on_odometry(self, reading: RawOdometry) -> None:
         """Register a received reading.

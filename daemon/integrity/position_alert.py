@@ -7,7 +7,7 @@ import math
 from typing import Final
 
 from daemon.integrity.evidence import Evidence
-from daemon.integrity.state_machine import HELD
+from daemon.integrity.state_machine import HELD, disagreed
 from daemon.integrity.state_memory import Memory
 
 CLEAR_S: Final = 1.0
@@ -24,11 +24,19 @@ def bounded(memory: Memory, evidence: Evidence) -> bool:
 
     A protection level assumes that the pose is roughly right, and limits its error. It is not available during
     relocalisation, for a lost or unconfirmed pose, or when light or the latest scan contradicts it. Nor is it available
-    before the heading has converged, because no covariance covers where that leads.
+    before the heading has converged, because no covariance covers where that leads. While odometry and lidar contradict
+    each other, one of them is wrong, and only light can show which.
     """
     in_doubt = memory.doubt or memory.failed > 0 or evidence.guessed or evidence.places is not None
     in_doubt = in_doubt or memory.odd_since is not None or _turning(memory, evidence)
+    in_doubt = in_doubt or (disagreed(memory, evidence) and not _lit(evidence))
     return memory.state in HELD and not in_doubt
+
+
+def _lit(evidence: Evidence) -> bool:
+    """Whether light confirms the pose."""
+    light = evidence.light
+    return light is not None and light.placed and light.used and light.agrees is True
 
 
 def _turning(memory: Memory, evidence: Evidence) -> bool:

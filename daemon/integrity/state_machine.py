@@ -157,7 +157,7 @@ def _say_of_pose(memory: Memory, evidence: Evidence) -> tuple[State, Reason]:
         return State.DEGRADED, Reason.LIGHT_DISAGREES
     if not all(memory.known) and (memory.good >= AXIS_FOUND_SCANS or memory.state in HELD):
         return State.DEGRADED, Reason.UNCERTAIN if evidence.guessed else Reason.AXIS_UNKNOWN
-    if memory.disagree_since is not None and evidence.t_mono - memory.disagree_since >= DISAGREE_S:
+    if disagreed(memory, evidence):
         return State.DEGRADED, Reason.WITNESSES_DISAGREE
     missing = _missing(memory, evidence)
     if missing is not None:
@@ -189,6 +189,11 @@ def _missing(memory: Memory, evidence: Evidence) -> Reason | None:
         return Reason.ODOMETRY_SILENT
     dark = memory.lit_last is not None and evidence.t_mono - memory.lit_last > DARK_S
     return Reason.LIGHT_DARK if light is not None and light.placed and dark else None
+
+
+def disagreed(memory: Memory, evidence: Evidence) -> bool:
+    """Whether odometry and lidar have contradicted each other for a while."""
+    return memory.disagree_since is not None and evidence.t_mono - memory.disagree_since >= DISAGREE_S
 
 
 def _contradicted(memory: Memory, evidence: Evidence) -> bool:

@@ -252,6 +252,7 @@ class Cycle:
         self.verdict = judge(self.verdict, evidence)
         compared = bool(self.lidar_ok(t_mono)) and self.observer.unused is None
         self.watch.on_verdict(t_mono, self.verdict, compared)
+        self.watch.on_match(None if fresh is None else fresh.match)
         self.trust = self._trust(t_mono, evidence)
         self._state_log.on_cycle(t_mono, self.verdict.state, self.verdict.reason)
         return self.verdict
@@ -315,6 +316,7 @@ class Cycle:
             lidar_silent=self.lidar_ok(t_mono) is False and self.lidar_silence(t_mono) is not None,
             scans_dropped=inbox.dropped,
             scans_late=watch.late,
+            scans_repeated=watch.repeated,
             scans_misfit=watch.misfit,
             lag_s=0.0 if result is None or result.lag is None else result.lag.lag_s,
             slow=None if result is None else result.slow,

@@ -44,6 +44,7 @@ class CycleFacts:
         short: cycles that skipped map work or the lidar for lack of time. period: of scans, s.
         lidar: status of the driver, live. lidar_silent: scans have arrived before and do not arrive now.
         scans_dropped: not consumed by any cycle. scans_late: arrived late. scans_misfit: inconsistent with the map.
+        scans_repeated: equal to an earlier one although the robot has moved.
         lag_s: estimated delay of the lidar behind the odometry, s.
         slow: lasting errors of odometry and lidar mount, None while none is large.
         odometry_ok: None where there is none. odometry_jumps: readings that no motion explains.
@@ -66,6 +67,7 @@ class CycleFacts:
     lidar_silent: bool
     scans_dropped: int
     scans_late: int
+    scans_repeated: int
     scans_misfit: bool
     lag_s: float
     slow: SlowErrors | None

@@ -44,6 +44,7 @@ def vitals(facts: CycleFacts, failed: set[str], process: ProcessFacts) -> Vitals
         odometry_jumps=facts.odometry_jumps,
         disagree=facts.odometry_disagrees,
         late=facts.scans_late,
+        repeated=facts.scans_repeated,
         misfit=facts.scans_misfit,
         lag=facts.lag_s,
         slow=facts.slow,

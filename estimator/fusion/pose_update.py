@@ -21,7 +21,7 @@ LEAST_NOISE_M = 0.004
 LEARNING = 0.02
 HELD, HELD_YAW = 100.0, 830.0
 """Smallest information of a known direction, and of the heading: 10 cm, 2 deg (`MatchResult.known_axes`)."""
-BLIND = (Reason.TOO_FEW_POINTS, Reason.MALFORMED, Reason.LATE, Reason.PASSED_OVER)
+BLIND = (Reason.TOO_FEW_POINTS, Reason.MALFORMED, Reason.LATE, Reason.REPEATED, Reason.PASSED_OVER)
 """Results of a scan without usable data: they do not contradict the map."""
 CAUCHY = 0.807
 """Share of a Gaussian's variance that remains under the robust weights of the matcher."""

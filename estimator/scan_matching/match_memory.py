@@ -22,6 +22,8 @@ class MatchMemory:
         t_match, T_odom_match: instant (s) and pose of the latest scan that matched.
         t_newest_scan: end of the latest scan, s.
         bearing_rad: the latest bearings that passed validation.
+        first_alike, driven: ranges (m) of the first of several scans that are all alike, and the motion of the wheels
+            since (x, y, yaw).
         scans_since_keyframe: scans since the newest keyframe.
         failures: consecutive scans that did not match.
         restarts: number of local map restarts because nothing fitted the old one.
@@ -39,6 +41,8 @@ class MatchMemory:
     T_odom_match: Array = field(default_factory=se2.identity)
     t_newest_scan: float = -math.inf
     bearing_rad: Array | None = None
+    first_alike: Array = field(default_factory=lambda: np.empty(0))
+    driven: Array = field(default_factory=se2.identity)
     scans_since_keyframe: int = 0
     failures: int = 0
     restarts: int = 0

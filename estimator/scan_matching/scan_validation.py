@@ -2,8 +2,9 @@
 
 A non-finite bearing or mount would become an array index in the kernels. At an angle of millions of turns rounding
 merges the beams into a scan that fits anywhere. So do beams that all have about one bearing: their ends lie on a line,
-which fits every wall. Arrays of different lengths, or a scan that ends before it begins, are
-program errors.
+which fits every wall. A scan that repeats another one to the last bit, although the wheels have moved the robot, is no
+new measurement: range noise alone makes every scan different. Arrays of different lengths, or a scan that ends before
+it begins, are program errors.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import math
 
 import numpy as np
 
-from estimator.measurements import Scan
+from estimator.measurements import Beam, Odometry, Scan
+from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.result import Reason
 from estimator.scan_matching.deskew import ScanPoints
@@ -30,6 +32,8 @@ NARROWEST = 0.5
 """Smallest field of a scan, rad: a third of the narrowest lidar's, and of a depth camera's that is used as one."""
 FEW = 32
 """Beams up to which a scan may be narrower, because the matcher finds too few points in it."""
+MOVED_M, MOVED_RAD = 0.05, 0.05
+"""Motion (m, rad) that changes every scan by more than the resolution of the worst lidar."""
 
 
 def refused(matching: MatchMemory, scan: Scan) -> Reason | None:
@@ -38,7 +42,24 @@ def refused(matching: MatchMemory, scan: Scan) -> Reason | None:
         return Reason.MALFORMED
     late = scan.t_end < matching.t_newest_scan
     matching.t_newest_scan = scan.t_end
-    return Reason.LATE if late else None
+    if late:
+        return Reason.LATE
+    return Reason.REPEATED if repeated(matching, scan) else None
+
+
+def on_odometry(matching: MatchMemory, record: Odometry) -> None:
+    """Add a motion of the wheels since the first of the scans that are alike."""
+    if np.isfinite(record.delta).all():
+        matching.driven = matching.driven + record.delta
+
+
+def repeated(matching: MatchMemory, scan: Scan) -> bool:
+    """Whether a scan equals the ones before it although the robot has moved; few returns may be equal by chance."""
+    if int(np.count_nonzero(scan.beam == Beam.HIT)) <= FEW or not np.array_equal(scan.range_m, matching.first_alike):
+        matching.first_alike, matching.driven = scan.range_m, se2.identity()
+        return False
+    x, y, yaw = matching.driven.tolist()
+    return math.hypot(x, y) > MOVED_M or abs(yaw) > MOVED_RAD
 
 
 def well_formed(scan: Scan) -> bool:

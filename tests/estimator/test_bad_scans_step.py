@@ -211,6 +211,27 @@ def test_the_same_scan_again_and_again_is_the_same_place(method_name: str) -> No
     assert again.match.ok
 
 
+@pytest.mark.parametrize("method_name", METHODS)
+def test_a_scan_that_is_repeated_while_the_wheels_drive_is_no_measurement(method_name: str) -> None:
+    """A lidar whose driver or relay sends one scan again and again: the wheels carry the pose, as far as they do."""
+    state, T = settled(method_name)
+    noise, ahead = np.random.default_rng(4), np.array((0.02, 0.0, 0.0))
+    frozen, said = scan_at(T, 1.2, 50, noise), []
+    for _ in range(20):
+        T = se2.compose(T, ahead)
+        t = state.motion.t_mono + 0.05
+        wheels = Odometry(state.motion.t_odometry, t, ahead)
+        said.append(step(state, [wheels, replace(frozen, t_begin=t, t_end=t)], UNLIMITED))
+    reasons = [result.match.reason for result in said if result.match is not None]
+    assert reasons[4:] == [Reason.REPEATED] * 16
+    assert np.abs(said[-1].T_odom_base - T)[0] < 0.1
+    assert honest(said[-1], T)
+    back = stand(state, state.motion.t_mono + 0.05, scan_at(T, state.motion.t_mono + 0.05, 51, noise))
+    assert back.match is not None
+    assert back.match.ok
+    assert honest(back, T)
+
+
 def test_a_hundred_thousand_beams() -> None:
     """Two hundred times the map's density, no error, no other place."""
     state, T = settled(LUMILOOP)

@@ -93,6 +93,12 @@ def test_large_errors_of_wheels_and_mount_are_named_with_their_values() -> None:
     assert "differs from `lidar.mount` by +5.7 deg (sigma 0.3)" in describe(Fault.LIDAR_TURNED, mount)
 
 
+def test_a_lidar_that_repeats_one_scan_is_the_cause_of_what_follows_from_it() -> None:
+    frozen = replace(WELL, repeated=BEFORE.repeated + 40, misfit=True, disagree=True)
+    assert assess(frozen, BEFORE) == (Fault.LIDAR_FROZEN, Fault.LIDAR_MISFIT, Fault.ODOMETRY_DISAGREES)
+    assert assess(replace(WELL, repeated=40), replace(BEFORE, repeated=40)) == ()
+
+
 def test_only_what_is_new_counts() -> None:
     old = replace(BEFORE, invalid=1000, missed=1000, overruns=1000, jobs_failed=5, odometry_jumps=3)
     now = replace(WELL, invalid=1000, missed=1000, overruns=1000, jobs_failed=5, odometry_jumps=3, odometry=True)

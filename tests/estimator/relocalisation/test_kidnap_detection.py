@@ -15,7 +15,6 @@ from estimator.pipeline import new_state
 from estimator.relocalisation import (
     global_scan_match,
     kidnap_detection,
-    kidnap_opportunity,
     relocalisation,
     unaligned_map,
 )
@@ -347,39 +346,6 @@ def test_after_a_leap_it_is_adrift_where_another_place_fits(
         state.relocalisation.suspicion.question = again = Question(False, True, True, True)
         kidnap_detection.answered(state, again, said)
         assert state.map.parts.detached is not None
-
-
-@pytest.mark.parametrize("own", [Verdict.HOLDS, Verdict.OPEN])
-@pytest.mark.parametrize("odd", [True, False])
-def test_without_a_sign_of_motion_another_place_that_fits_is_no_reason_to_give_one_up(own: Verdict, odd: bool) -> None:
-    """After a rest without data, odometry carries a pose that the map does not confirm; the search goes on."""
-    robot = driven(CUPBOARD, ABOUT)
-    assert robot.T is not None
-    here = Fit(robot.T, np.eye(3), 0.7, 0.0, 0.01, 1, np.zeros(3), own)
-    other = Fit(OTHER_END, np.eye(3), 0.86, 0.0, 0.01, 1, np.zeros(3), Verdict.HOLDS)
-    state = robot.state
-    state.relocalisation.suspicion.question = asked = Question(False, False, False, share=0.6, odd=odd)
-    kidnap_detection.answered(state, asked, Looked(None, (here,), ((other, ()),), True, 0))  # type: ignore[arg-type]
-    assert (state.map.parts.detached is not None) is (odd or own is not Verdict.HOLDS)
-    state.motion.odometry = True
-    assert state.map.parts.detached is None or relocalisation.dead_reckons(state) is not odd
-
-
-@pytest.mark.parametrize(
-    ("shares", "unresolved"),
-    [((), True), ((-1.0, -1.0), True), ((0.0, 0.0), False), ((0.2, 0.25, 0.2), False), ((0.6, 0.8, 0.7), True)],
-)
-def test_after_a_rest_scans_that_see_through_most_of_the_map_tell_a_kidnapping(
-    shares: tuple[float, ...], unresolved: bool
-) -> None:
-    """A fifth may be a door, or people who were mapped: half of the scans without a match see that much."""
-    robot = driven(CUPBOARD, ABOUT)
-    state, doubt = robot.state, robot.state.relocalisation.suspicion
-    doubt.unwatched_s, doubt.t_still, state.matching.t_match = 5.0, state.motion.t_mono, state.motion.t_mono - 6.0
-    assert kidnap_opportunity.since_match(state)
-    for share in shares:
-        doubt.contradiction.add(share)
-    assert kidnap_opportunity.unresolved(state) is unresolved
 
 
 def test_a_leap_in_a_map_of_which_nothing_is_finished_is_let_go() -> None:
