@@ -119,3 +119,14 @@ def test_no_bound_in_any_other_state(state: State) -> None:
 )
 def test_no_bound_of_a_place_in_doubt(memory: Memory, evidence: Evidence) -> None:
     assert not bounded(memory, evidence)
+
+
+@pytest.mark.parametrize(("agrees", "stands"), [(None, False), (False, False), (True, True)])
+def test_no_bound_while_odometry_and_lidar_contradict_each_other_unless_light_decides(
+    agrees: bool | None, stands: bool
+) -> None:
+    light = Light(True, used=agrees is not None, placed=agrees is not None, agrees=agrees)
+    memory = Memory(State.DEGRADED, Reason.WITNESSES_DISAGREE, disagree_since=5.0, tracked=True)
+    evidence = Evidence(10.0, light=light)
+    assert bounded(memory, evidence) is stands
+    assert bounded(structs.replace(memory, disagree_since=None), evidence)
