@@ -9,6 +9,7 @@ import numpy as np
 
 from estimator.commands import obey
 from estimator.fusion import (
+    gyro_calibration,
     map_odom_filter,
     motion_model,
     mount_correction,
@@ -140,6 +141,7 @@ def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
         wheel_calibration.on_heading(
             state.wheels, float(match.correction[2]), variance, float(state.motion.velocity[2])
         )
+    T_before, t_before = state.matching.T_odom_scan, state.matching.t_scan
     more = fuse(state.pose, state.motion, state.matching, match, state.settings.noise)
     if more is not None:  # the path too, or no loop could join submaps again
         state.map.graph.loosen(more, state.pose.T_odom_anchor)
@@ -147,6 +149,9 @@ def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
     time_offset.on_match(state.time_offset, scan, match)
     if state.settings.calibrate:
         complete = match.ok and bool(match.known_axes.all()) and loose_direction(match.information) is None
+        if match.ok:
+            turned = se2.between(T_before, match.T_odom_base)[2]
+            gyro_calibration.on_match(state.wheels.gyro, float(turned), state.motion.t_mono - t_before)
         wheel_calibration.on_match(state.wheels, state.motion.t_mono, state.motion.T_odom_base, complete)
 
 
@@ -230,6 +235,8 @@ def predict(state: State, record: Record) -> None:
     if order(record)[0] == -math.inf:
         return  # no valid instant
     noise = state.settings.noise
+    if isinstance(record, Imu) and state.settings.calibrate and not gyro_calibration.usable(state.wheels.gyro, record):
+        return
     before = state.motion.T_odom_base, state.motion.P, state.motion.t_mono
     if state.light is not None:
         state.light.predict(record)
@@ -346,6 +353,7 @@ def report(state: State, match: MatchResult | None, keyframe: int, limits: Limit
         lag=state.time_offset.told,
         slow=state.wheels.told,
         jumped=math.sqrt(state.wheels.doubt),
+        gyro=state.wheels.gyro.told,
         jobs=state.jobs.take() if limits.level < DegradationLevel.NO_MAP else (),
         anew=state.matching.restarts,
         protection=protection_level.bound(pose, motion, state.light, state.matching, total, state.wheels.mount_rad),

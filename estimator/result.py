@@ -346,6 +346,7 @@ class StepResult:
         lag: time offset between the stamps of scans and odometry, None while it is not certain.
         slow: lasting errors of wheels and lidar mount, None while none is large.
         jumped: sigma (rad) of the heading after a jump that wheels do not explain; ``covariance`` includes it.
+        gyro: factor of the gyro's readings over the true turn, None while it is about 1.
         jobs: work for the background worker; each result returns as a record of a later step.
     """
 
@@ -375,4 +376,5 @@ class StepResult:
     lag: Lag | None = None
     slow: SlowErrors | None = None
     jumped: float = 0.0
+    gyro: float | None = None
     jobs: tuple[Job, ...] = ()

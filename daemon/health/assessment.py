@@ -28,7 +28,7 @@ REPLAYED: Final = frozenset(
     (
         *(Fault.NO_LAMPS, Fault.SURVEY_CONTRADICTED, Fault.TWIN_LAMPS, Fault.LAMP_MOVED, Fault.LAMP_DEAD),
         *(Fault.LIDAR_MISFIT, Fault.LIDAR_TURNED, Fault.LIDAR_FROZEN, Fault.ODOMETRY_SILENT),
-        *(Fault.ODOMETRY_DISAGREES, Fault.ODOMETRY_SCALE, Fault.PROTECTION_ALERT),
+        *(Fault.ODOMETRY_DISAGREES, Fault.ODOMETRY_SCALE, Fault.GYRO_SCALE, Fault.PROTECTION_ALERT),
     )
 )
 """Faults that follow from the data alone, so that a replay reproduces them. All others come from drivers or from the
@@ -46,6 +46,7 @@ class Vitals:
         lag: time offset in s of the scan stamps behind the odometry, 0: not available. misfit: scans are inconsistent
             with the map.
         slow: lasting errors of odometry and lidar mount, None while none is large.
+        gyro: factor of its readings over the true turn, None while it is about 1.
         odometry: whether it arrives, None where not configured. odometry_jumps: counter. disagree: with the lidar.
         readings, readings_missed, readings_old: counters of odometry readings that arrived, were lost, and arrived
             late.
@@ -76,6 +77,7 @@ class Vitals:
     misfit: bool = False
     lag: float = 0.0
     slow: SlowErrors | None = None
+    gyro: float | None = None
     readings: int = 0
     readings_missed: int = 0
     readings_old: int = 0
@@ -146,6 +148,8 @@ def _words(fault: Fault, now: Vitals) -> str:
         return ", ".join(sorted(_publishers(now) if fault is Fault.PUBLISHER_FAILED else _others(now)))
     if fault in (Fault.LIDAR_TURNED, Fault.ODOMETRY_SCALE) and now.slow is not None:
         return _of_mount(now.slow) if fault is Fault.LIDAR_TURNED else _of_wheels(now.slow)
+    if fault is Fault.GYRO_SCALE and now.gyro is not None:
+        return f"it measures {now.gyro:.2f} times the true turn"
     late = fault is (Fault.LIDAR_LATE if now.lag > 0.0 else Fault.ODOMETRY_GAPS)
     return f"scan stamps are late by {now.lag:+.2f} s against odometry" if now.lag and late else ""
 
@@ -243,6 +247,8 @@ def _odometry(now: Vitals, before: Vitals) -> Iterable[Fault]:
         yield Fault.ODOMETRY_GAPS
     if now.slow is not None and now.slow.wheels:
         yield Fault.ODOMETRY_SCALE
+    if now.gyro is not None:
+        yield Fault.GYRO_SCALE
     if now.alert:
         yield Fault.PROTECTION_ALERT
 

@@ -19,6 +19,7 @@ CONSEQUENCES: Final[dict[Fault, frozenset[Fault]]] = {
     Fault.COMPUTER_SLOW: _LATE | {Fault.LOOP_STALLED, Fault.OVERRUNS, Fault.OVERLOADED},
     Fault.LOOP_STALLED: _LATE,
     Fault.LIDAR_TURNED: frozenset((Fault.ODOMETRY_DISAGREES,)),
+    Fault.GYRO_SCALE: frozenset((Fault.ODOMETRY_DISAGREES,)),
     Fault.LIDAR_FROZEN: frozenset((Fault.ODOMETRY_DISAGREES, Fault.LIDAR_MISFIT)),
     Fault.ODOMETRY_SCALE: frozenset((Fault.ODOMETRY_DISAGREES,)),
     Fault.NO_DESCRIPTORS: frozenset(

@@ -45,6 +45,7 @@ class Fault(IntEnum):
     ODOMETRY_DISAGREES = 203
     ODOMETRY_GAPS = 204
     ODOMETRY_SCALE = 205
+    GYRO_SCALE = 206
     PROTECTION_ALERT = 251
     LOOP_STALLED = 301
     OVERRUNS = 302
@@ -181,6 +182,10 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
     Fault.ODOMETRY_SCALE: (
         "odometry has a constant scale error or drift, which is corrected in the pose",
         "measure wheels and track, or record a drive and run `lumiloop calibrate --odometry`; then correct its sender",
+    ),
+    Fault.GYRO_SCALE: (
+        "the gyro measures turns with a wrong factor; its readings are not used",
+        "send the turn about the vertical axis in rad, counter-clockwise positive (REP-103); check unit, sign and axis",
     ),
     Fault.PROTECTION_ALERT: (
         "the protection level is above `integrity.alert_m`, or there is none",

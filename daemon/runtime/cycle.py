@@ -320,6 +320,7 @@ class Cycle:
             scans_misfit=watch.misfit,
             lag_s=0.0 if result is None or result.lag is None else result.lag.lag_s,
             slow=None if result is None else result.slow,
+            gyro=None if result is None else result.gyro,
             odometry_ok=self.observer.odometry_ok(t_mono, inbox.wheels.latest),
             odometry_jumps=self.odometry.jumps,
             odometry_disagrees=watch.disagree,

@@ -47,6 +47,7 @@ class CycleFacts:
         scans_repeated: equal to an earlier one although the robot has moved.
         lag_s: estimated delay of the lidar behind the odometry, s.
         slow: lasting errors of odometry and lidar mount, None while none is large.
+        gyro: factor of its readings over the true turn, None while it is about 1.
         odometry_ok: None where there is none. odometry_jumps: readings that no motion explains.
         odometry_disagrees: with the lidar. readings, readings_missed, readings_old: odometry readings that arrived,
         were
@@ -71,6 +72,7 @@ class CycleFacts:
     scans_misfit: bool
     lag_s: float
     slow: SlowErrors | None
+    gyro: float | None
     odometry_ok: bool | None
     odometry_jumps: int
     odometry_disagrees: bool

@@ -48,6 +48,7 @@ def vitals(facts: CycleFacts, failed: set[str], process: ProcessFacts) -> Vitals
         misfit=facts.scans_misfit,
         lag=facts.lag_s,
         slow=facts.slow,
+        gyro=facts.gyro,
         readings=facts.readings,
         readings_missed=facts.readings_missed,
         readings_old=facts.readings_old,

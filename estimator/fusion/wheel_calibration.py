@@ -20,6 +20,7 @@ from typing import Final
 
 import numpy as np
 
+from estimator.fusion.gyro_calibration import GyroCalibration
 from estimator.measurements import Odometry
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
@@ -96,6 +97,7 @@ class WheelCalibration:
         mount: correction of the lidar mount so far (x, y, yaw); ``errors`` has what remains.
         usual: mean square of heading corrections, rad^2. rate: turn rate at the latest one, rad/s.
         jumped: heading jump (rad) of the matches that neither wheels nor mount explain yet, 0 without one.
+        gyro: calibration of the gyro.
         told: errors beyond what a sound robot has; None where there is none.
     """
 
@@ -116,6 +118,7 @@ class WheelCalibration:
     usual: float = 0.0
     rate: float = 0.0
     jumped: float = 0.0
+    gyro: GyroCalibration = field(default_factory=GyroCalibration)
     told: SlowErrors | None = None
 
     @property

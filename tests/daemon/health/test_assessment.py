@@ -99,6 +99,12 @@ def test_a_lidar_that_repeats_one_scan_is_the_cause_of_what_follows_from_it() ->
     assert assess(replace(WELL, repeated=40), replace(BEFORE, repeated=40)) == ()
 
 
+def test_a_gyro_with_a_wrong_factor_is_named_with_it() -> None:
+    now = replace(WELL, gyro=57.3, disagree=True)
+    assert assess(now, BEFORE) == (Fault.GYRO_SCALE, Fault.ODOMETRY_DISAGREES)
+    assert "it measures 57.30 times the true turn" in describe(Fault.GYRO_SCALE, now)
+
+
 def test_only_what_is_new_counts() -> None:
     old = replace(BEFORE, invalid=1000, missed=1000, overruns=1000, jobs_failed=5, odometry_jumps=3)
     now = replace(WELL, invalid=1000, missed=1000, overruns=1000, jobs_failed=5, odometry_jumps=3, odometry=True)
