@@ -5,13 +5,23 @@ from __future__ import annotations
 import contextlib
 import os
 from pathlib import Path
+from typing import Final
+
+_NEW: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+"""Flags of a file that must not exist yet, as a link neither."""
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file atomically: temporary file, sync, rename. On `OSError` the previous content stays."""
+    """Write a file atomically: temporary file, sync, rename. On `OSError` the previous content stays.
+
+    Root may write into a folder of another user, such as the service's. The file then belongs to that user, and a link
+    in the place of the temporary file is not followed.
+    """
     beside = path.with_name(f".{path.name}.part")
     try:
-        with beside.open("wb") as file:
+        beside.unlink(missing_ok=True)  # of a killed process
+        with os.fdopen(os.open(beside, _NEW, 0o666), "wb") as file:
+            _give_to_owner(file.fileno(), path.parent)
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -21,6 +31,14 @@ def write_whole(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
         raise
+
+
+def _give_to_owner(handle: int, folder: Path) -> None:
+    """Give a file that root has made to the owner of its folder, who could not read it with a strict umask."""
+    about = folder.stat()
+    if os.geteuid() == 0 and about.st_uid:
+        with contextlib.suppress(OSError):  # a file system without owners, or root without that right
+            os.fchown(handle, about.st_uid, about.st_gid)
 
 
 def reason_of(error: Exception) -> str:
