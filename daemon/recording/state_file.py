@@ -5,7 +5,8 @@ CRC-32 of all that (u32). Then follow blocks, each with the length of its conten
 deflated content. The first block contains the bytes of the lidar line that the codec needs, as records. Each of the
 others contains a msgpack array of nodes as `daemon.recording.state_schema` defines them, by number. The last entry is
 an `End`. The inflated blocks have at most :data:`MOST_BYTES` in all, each :data:`MOST_BLOCK`, and the nodes
-:data:`MOST_VALUES`: a value of one byte takes 50 in memory.
+:data:`MOST_VALUES`: a value of one byte takes 50 in memory. Nodes are therefore decoded one by one, and only those of a
+possible length.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 
@@ -37,8 +38,14 @@ _START: Final = struct.Struct("<8sHI")
 _BLOCK: Final = struct.Struct("<II")
 _CRC: Final = struct.Struct("<I")
 
+MOST_ENTRIES: Final = 1 << 18
+"""Limit of the nodes in one block; one of usual size has 4096."""
+_DATA: Final = (b"\xa5array", b"\xa5bytes")
+"""Tags of nodes that can be longer than :data:`MOST_VALUES` bytes: they consist of data."""
+
 _encode: Final = msgspec.msgpack.Encoder().encode
-_decode: Final = msgspec.msgpack.Decoder(list[Node | End]).decode
+_split: Final = msgspec.msgpack.Decoder(Annotated[list[msgspec.Raw], msgspec.Meta(max_length=MOST_ENTRIES)]).decode
+_decode: Final = msgspec.msgpack.Decoder(Node | End).decode
 
 
 class BadState(Exception):
@@ -185,21 +192,29 @@ def _inflated(path: Path, content: bytes, most: int) -> bytes:
 
 def _nodes(path: Path, plain: Iterator[bytes]) -> Iterator[Node]:
     count, left, ended = 0, MOST_VALUES, False
-    for content in plain:
-        try:
-            entries = _decode(content)
-        except (msgspec.DecodeError, RecursionError) as error:
-            raise BadState(f"{path.name}: damaged: {error}") from error
-        for entry in entries:
-            if ended or (isinstance(entry, End) and entry.nodes != count):
-                raise BadState(f"{path.name}: damaged")
-            if isinstance(entry, End):
-                ended = True
-                continue
-            count += 1
-            left -= count_of(entry)
-            if left < 0:
-                raise BadState(f"{path.name}: more than {MOST_VALUES} values")
-            yield entry
+    for entry in _entries(path, plain):
+        if ended or (isinstance(entry, End) and entry.nodes != count):
+            raise BadState(f"{path.name}: damaged")
+        if isinstance(entry, End):
+            ended = True
+            continue
+        count += 1
+        left -= count_of(entry)
+        if left < 0:
+            raise BadState(f"{path.name}: more than {MOST_VALUES} values")
+        yield entry
     if not ended:
         raise BadState(f"{path.name}: torn")
+
+
+def _entries(path: Path, plain: Iterator[bytes]) -> Iterator[Node | End]:
+    """Yields the entries of the blocks; refuses those whose values could not all be held."""
+    for content in plain:
+        try:
+            for raw in _split(content):
+                packed = memoryview(raw)
+                if len(packed) > MOST_VALUES and bytes(packed[1:7]) not in _DATA:
+                    raise BadState(f"{path.name}: more than {MOST_VALUES} values")
+                yield _decode(packed)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise BadState(f"{path.name}: damaged: {error}") from error

@@ -19,7 +19,7 @@ from functools import lru_cache
 from importlib import import_module
 from pkgutil import iter_modules
 from types import FunctionType
-from typing import Any, Final, cast
+from typing import Annotated, Any, Final, cast
 from weakref import WeakSet
 
 import msgspec
@@ -58,6 +58,8 @@ CONTAINERS: Final[dict[type, str]] = {
     deque: "deque",
     WeakSet: "weakset",
 }
+MOST_AXES: Final = 64
+"""Limit of the dimensions of a numpy array (numpy 2)."""
 PLAIN: Final = "biufcSU"
 """Kinds of numpy arrays allowed: no objects, no structures."""
 
@@ -93,7 +95,7 @@ class Array(msgspec.Struct, array_like=True, tag="array", frozen=True):
     """A numpy array, or with ``scalar`` a number of its type; ``order``: ``C`` or ``F``."""
 
     dtype: str
-    shape: tuple[int, ...]
+    shape: Annotated[tuple[int, ...], msgspec.Meta(max_length=MOST_AXES)]
     order: str
     data: bytes
     scalar: bool = False

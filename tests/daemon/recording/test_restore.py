@@ -259,6 +259,7 @@ from pathlib import Path
 from daemon.recording.restore import CannotRestore, restore
 from daemon.recording import state_file
 path = Path(sys.argv[1])
+REF = b"\\x91\\0"  # a reference to node 0
 head = state_file._head({"cycle": 1})
 blocks = [state_file._packed(b"line")]
 blocks += [state_file._packed(eval(sys.argv[2]))] * int(sys.argv[3])
@@ -282,6 +283,9 @@ LONG_LIST = "(b'\\x94\\xa4many\\xa4list\\xdd' + struct.pack('>I', 60 << 20) + by
         ("b'\\x91' * (1 << 20)", 1),  # nested without end
         ("b'\\x91\\x94\\xa4many\\xa4list\\xdd' + struct.pack('>I', 1 << 28) + bytes(1 << 20)", 1),
         (f"b'\\x91' + {LONG_LIST}", 8),
+        (f"b'\\x91' + {LONG_LIST.replace('bytes(60 << 20)', '(30 << 20) * REF').replace('60', '30')}", 1),
+        ("b'\\xdd' + struct.pack('>I', 60 << 20) + bytes(60 << 20)", 1),  # so many nodes
+        (f"b'\\x91' + {LONG_LIST}".replace("x94\\xa4many\\xa4list", "x96\\xa5array\\xa2f8"), 1),  # so many dimensions
         (f"b'\\xdc\\x00\\x3c' + 60 * ({LONG_LIST.replace('60', '1')})", 8),
         ("b'\\x91\\x95\\xa5array\\xa2f8\\x91\\xcf' + struct.pack('>Q', 1 << 60) + b'\\xa1C\\xc4\\x00'", 1),
     ],
