@@ -52,6 +52,8 @@ _PORTS: Final = (
     (7447, "ZENOH_ROUTER", "Zenoh router of `lumiloop fleet` and `lumiloop ros2`", "`--router` changes it"),
 )
 """Default ports."""
+_DIGITS: Final = 10
+"""Digits of the longest number, of 32 bits."""
 _MOST: Final = 12
 """Explanations printed for one word; a whole table of keys has fewer."""
 
@@ -216,7 +218,7 @@ def find(asked: str, everything: Sequence[Entry]) -> list[Entry]:
     """
     kind, _, last = asked.lower().rpartition(" ")
     of_kind = [entry for entry in everything if kind in entry.kind]
-    if last.isascii() and last.isdigit():
+    if last.isascii() and last.isdigit() and len(last) <= _DIGITS:
         return [entry for entry in of_kind if int(last) in entry.numbers]
     named = _named(asked.lower().split(), everything)
     within = [entry for entry in of_kind if f".{last}." in f".{entry.name.lower()}."]

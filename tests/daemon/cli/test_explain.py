@@ -47,6 +47,11 @@ def test_a_program_reads_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert "did you mean tracking" in json.loads(capsys.readouterr().out)["hint"]
 
 
+def test_a_number_without_end_is_not_found(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", "1" * 5000]) == FAILED  # Python converts no more than 4300 digits
+    assert "no such name or number" in capsys.readouterr().err
+
+
 def test_a_table_gives_its_keys(capsys: pytest.CaptureFixture[str]) -> None:
     told = _told(capsys, "photodiode")
     assert all(option.path in told for option in options() if option.path.startswith("photodiode."))
