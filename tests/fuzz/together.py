@@ -49,6 +49,8 @@ SETTLED: Final = 1.0 / 3.0
 SPOILT: Final = 0.02
 """Share of the lidar's pieces that are damaged on the way: scans come between."""
 GROWN_MB: Final = 5.0
+REPLAY_S: Final = 120.0
+"""Time limit in s of the replay of a damaged file."""
 PAUSE_S: Final = 0.005
 """After each input of an attacker: some hundred a second, from each."""
 ORDERS: Final = [
@@ -112,8 +114,15 @@ class Attack:
         self.go(go)
 
     def go(self, work: Callable[[], None]) -> None:
-        """Work in a thread of its own, until it sees that all is over."""
-        thread = threading.Thread(target=work, daemon=True)
+        """Work in a thread of its own, until it sees that all is over; an error of it is a defect."""
+
+        def guarded() -> None:
+            try:
+                work()
+            except Exception as error:  # noqa: BLE001  shown with the result
+                self.broken.append(repr(error)[:500])
+
+        thread = threading.Thread(target=guarded, daemon=True)
         self._threads.append(thread)
         thread.start()
 
@@ -121,7 +130,7 @@ class Attack:
         """Wait for all threads."""
         self.over.set()
         for thread in self._threads:
-            thread.join(60.0)
+            thread.join(REPLAY_S)
 
 
 def to_stream(family: socket.AddressFamily, address: Any) -> Send:
@@ -159,8 +168,8 @@ def to_line(master: int) -> Send:
     """Bytes on a serial line, whose answers are thrown away."""
 
     def send(data: bytes) -> None:
+        os.write(master, data[:600])  # BlockingIOError: nobody reads the line, which counts as refused
         with contextlib.suppress(BlockingIOError):
-            os.write(master, data[:600])
             os.read(master, 4096)
 
     return send
@@ -194,13 +203,15 @@ def to_fleet(session: zenoh.Session) -> Send:
 def replays(kept: list[bytes], folder: Path, attack: Attack) -> None:
     """Damaged recordings and logs, by the installed command; what it prints goes to a log."""
     chance, mend = random.Random("replay"), target("log").mend
+    work = folder / "replay"  # what is replayed is no log of a process
+    work.mkdir()
     with (folder / "replay.log").open("wb") as log:
         while not attack.over.wait(1.0):
             whole = chance.choice(kept)
-            file = folder / ("a.lumirec" if whole.startswith(b"LUMIREC") else "a.log")
+            file = work / ("a.lumirec" if whole.startswith(b"LUMIREC") else "a.log")
             file.write_bytes(mend(damaged(whole, kept, chance)))
-            words = [sys.executable, "-m", "daemon", "replay", str(file), "--out", str(folder / "replayed")]
-            subprocess.run(words, stdout=log, stderr=log, timeout=120.0, check=False)
+            words = [sys.executable, "-m", "daemon", "replay", str(file), "--out", str(work / "out")]
+            subprocess.run(words, stdout=log, stderr=log, timeout=REPLAY_S, check=False)
             attack.sent["replay"] += 1
 
 
