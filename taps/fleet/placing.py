@@ -273,7 +273,7 @@ def _place_beside_daemon(store: Store, content: bytes, map_id: int) -> tuple[Pat
     """
     try:
         generations = store.generations()
-        if any(one.map_id == map_id for one in generations):
+        if any(store.identity(one) == map_id for one in generations):
             raise Refused(
                 f"{store.folder}: a running daemon keeps map {map_id:08x} there; stop the daemon and try again"
             )

@@ -131,6 +131,19 @@ def test_a_map_is_what_the_next_start_takes(tmp_path: Path, shared_map: Path) ->
     assert start.stored.meta.map_id == 0x77
 
 
+def test_a_map_that_an_operator_has_placed_is_the_daemons_own_too(tmp_path: Path, shared_map: Path) -> None:
+    given = settings(tmp_path)
+    daemon = Store(Path(given.map.folder))
+    daemon.claim()
+    (Path(given.map.folder) / "hall.lumimap").write_bytes(shared_map.read_bytes())
+    offer, content = offer_of(MAP, shared_map, 1)
+    try:
+        with pytest.raises(Refused, match="a running daemon keeps map 00000077 there"):
+            install(offer, content, given, None)
+    finally:
+        daemon.close()
+
+
 def test_beside_a_running_daemon_another_map_is_put_and_its_own_is_not_touched(
     tmp_path: Path, shared_map: Path
 ) -> None:
