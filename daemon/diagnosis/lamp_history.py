@@ -14,10 +14,11 @@ from typing import Final
 
 import numpy as np
 
-from daemon.maps.container import BadMap
+from daemon.maps.container import MOST_BYTES, BadMap
 from daemon.maps.schema import read
 from daemon.maps.store import Store
 from daemon.system.atomic_file import write_whole
+from daemon.system.regular_file import read_regular
 
 DAY_S: Final = 86_400.0
 KEPT_S: Final = 5 * 365 * DAY_S
@@ -80,7 +81,7 @@ def in_maps(folder: Path) -> list[Look]:
     looks = []
     for generation in Store(folder, mend=False).generations():
         try:
-            stored = read(generation.path.read_bytes())
+            stored = read(read_regular(generation.path, MOST_BYTES))
         except (BadMap, OSError):
             continue
         if stored.meta.saved <= 0.0:

@@ -17,11 +17,12 @@ import numpy.typing as npt
 
 from daemon.config.paths import stored_maps
 from daemon.config.schema import Config
-from daemon.maps.container import BadMap, pack
+from daemon.maps.container import MOST_BYTES, BadMap, pack
 from daemon.maps.generations import said
 from daemon.maps.schema import Meta, Stored, Tables, read
 from daemon.maps.store import Store
 from daemon.system.atomic_file import write_whole
+from daemon.system.regular_file import read_named
 
 Array = npt.NDArray[np.float64]
 
@@ -57,7 +58,7 @@ def opened(path: Path) -> Stored:
         OSError: it cannot be read. BadMap: it cannot be used. Both name the file and the remedy.
     """
     try:
-        return read(path.read_bytes())
+        return read(read_named(path, MOST_BYTES))
     except OSError as error:
         raise OSError(f"{path}: cannot read the map: {said(error)}; name a map file, *.lumimap") from error
     except BadMap as error:

@@ -18,12 +18,13 @@ import msgspec
 import zenoh
 
 from daemon.config.paths import maps_folder
-from daemon.maps.container import BadMap
+from daemon.maps.container import MOST_BYTES, BadMap
 from daemon.maps.schema import read
 from daemon.maps.store import Store
 from daemon.publish.stream.client import Lost, Stream
 from daemon.publish.stream.messages import Faults, Frame, Hello, Loop, MapTiles, NotTheStream, Pose
 from daemon.system import console
+from daemon.system.regular_file import read_regular
 from hal.run_server import run_until_stopped
 from taps.fleet import messages
 from taps.fleet.claim import Claim
@@ -233,7 +234,7 @@ def name_of(folder: str, map_id: int) -> str:
         for one in Store(maps_folder(folder), mend=False).generations():
             if one.map_id == map_id:
                 with contextlib.suppress(BadMap):
-                    return read(one.path.read_bytes()).meta.name
+                    return read(read_regular(one.path, MOST_BYTES)).meta.name
     return ""
 
 

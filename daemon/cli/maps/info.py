@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from daemon.config.paths import stored_maps
-from daemon.maps.container import BadMap
+from daemon.maps.container import MOST_BYTES, BadMap
 from daemon.maps.generations import said
 from daemon.maps.schema import Stored, read, summary
 from daemon.maps.store import Store
 from daemon.system import console
+from daemon.system.regular_file import read_named
 
 LIST: Final = "{id:<8}  {saved:<23}  {submaps:>7}  {name:<20}  {file}"
 """Columns of the list of maps."""
@@ -25,6 +26,8 @@ LIST: Final = "{id:<8}  {saved:<23}  {submaps:>7}  {name:<20}  {file}"
 
 def folder(args: argparse.Namespace) -> int:
     """Lists the newest file of each map in the configured folder; returns the exit code."""
+    if not args.settings.map.kept:
+        return console.fail("maps are not stored, because `map.folder` is none; name a file or a folder", console.USAGE)
     return _list(stored_maps(args.settings.map.folder), args.json)
 
 
@@ -91,7 +94,7 @@ def verify(args: argparse.Namespace) -> int:
 def _read(path: Path) -> Stored | str:
     """Returns the content of a file, or why it cannot be used, with the remedy."""
     try:
-        return read(path.read_bytes())
+        return read(read_named(path, MOST_BYTES))
     except OSError as error:
         return f"{path}: cannot read the map: {said(error)}; name a map file, *.lumimap"
     except BadMap as error:

@@ -97,11 +97,12 @@ def map_id_of(text: str) -> int:
 
 
 def _identity(path: Path) -> int:
-    from daemon.maps.container import BadMap
+    from daemon.maps.container import MOST_BYTES, BadMap
     from daemon.maps.schema import read
+    from daemon.system.regular_file import read_named
 
     try:
-        return read(path.read_bytes()).meta.map_id
+        return read(read_named(path, MOST_BYTES)).meta.map_id
     except (OSError, BadMap) as error:
         raise ValueError(f"{path}: {error}") from None
 

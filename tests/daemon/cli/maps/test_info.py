@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -55,6 +56,11 @@ def test_info_lists_the_maps_of_a_folder_newest_first(tmp_path: Path, capsys: py
     assert "placed.lumimap: " in err
     assert parser.main(["map", "info", "--set", f"map.folder={tmp_path / 'none'}"]) == console.OK
     assert "no map" in capsys.readouterr().out
+    assert parser.main(["map", "info", "--set", "map.folder=none"]) == console.USAGE
+    assert "maps are not stored" in capsys.readouterr().err
+    os.mkfifo(tmp_path / "waits.lumimap")
+    assert parser.main(["map", "info", str(tmp_path)]) == console.FAILED
+    assert "waits.lumimap: cannot read the map: it is a FIFO" in capsys.readouterr().err
 
 
 def test_the_maps_of_the_service_are_meant_where_this_user_keeps_none(
