@@ -77,12 +77,12 @@ class LibraryLimit(logging.Filter):
         if self._now() >= self._until:
             self._until = self._now() + LIBRARY_S
             self._told.clear()
-        if self._told[name] == LIBRARY_LINES:
+        if self._told[name] >= LIBRARY_LINES:  # more than that: two threads at once
             self._left_out[name] += 1
             return False
         self._told[name] += 1
         if more := self._left_out.pop(name, 0):
-            record.msg, record.args = f"%s{LEFT_OUT}", (record.getMessage(), more)
+            record.msg = f"{record.msg}{LEFT_OUT % more}"
         return True
 
 

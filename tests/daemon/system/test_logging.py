@@ -176,7 +176,7 @@ def test_lines_of_a_terminal_have_date_time_and_zone(monkeypatch: pytest.MonkeyP
     assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}[+-]\d\d:\d\d INFO    said\n", stream.getvalue())
 
 
-def test_lines_of_a_library_cannot_fill_the_log_and_ours_are_all_there() -> None:
+def test_lines_of_a_library_cannot_fill_the_log_and_ours_are_all_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client provokes them: a WebSocket library has a line for each message that it cannot read."""
     clock, stream = [0.0], io.StringIO()
     handler = logging.StreamHandler(stream)
@@ -191,3 +191,6 @@ def test_lines_of_a_library_cannot_fill_the_log_and_ours_are_all_there() -> None
     assert sum("daemon" in line for line in lines) == 1000
     assert 90 <= sum("library" in line for line in lines) <= 110
     assert "library.server: message 100 (90 more such lines were skipped before it)" in lines
+    clock[0] = 1000.0
+    monkeypatch.setattr(logging, "raiseExceptions", False)
+    handler.handle(logging.LogRecord("library.server", logging.WARNING, "file", 1, "%d", ("no number",), None))
