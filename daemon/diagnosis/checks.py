@@ -241,7 +241,7 @@ def ports(case: Case) -> Iterator[Finding]:
             remedy = f"`ss -lnp` shows which program uses {port}; or set another {key}" if others else refused.remedy
             yield fix("ports", f"{key}: {name} {settings.bind}:{port}: {refused.problem}", remedy)
     if not bad:
-        yield good("ports", ", ".join(sorted({f"{key} {port}" for key, _, port in wanted})) + " is free")
+        yield good("ports", "free: " + ", ".join(sorted({f"{key} {port}" for key, _, port in wanted})))
 
 
 def rtu(case: Case) -> Iterator[Finding]:

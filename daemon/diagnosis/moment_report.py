@@ -95,7 +95,8 @@ def _state(told: Sequence[Moment], k: int) -> Iterator[str]:
             said += f"; sigma {math.sqrt(max(xx, yy)):.3f} m, {math.degrees(math.sqrt(tt)):.2f} deg"
         trust = one.snapshot.trust
         if trust.horizontal_m is not None:
-            rests = [name for name in ("laser", "light", "wheels") if getattr(trust, name)]
+            used = (("lidar", trust.laser), ("light", trust.light), ("odometry", trust.wheels))
+            rests = [name for name, bound in used if bound]
             said += f"; protection level {trust.horizontal_m:.2f} m by {', '.join(rests)}"
         yield said
     if one.snapshot.trust.places is not None:

@@ -48,7 +48,7 @@ class StateLog:
             self._begun, self._lines = t_mono, 0
         meaning, remedy = REASONS[reason]
         what = f" ({remedy})" if remedy else ""
-        changes = f"; {self._left_out} further changes since the previous line" if self._left_out > 1 else ""
+        changes = f"; {self._left_out} changes since the previous line" if self._left_out > 1 else ""
         log.info("%s: %s%s%s", state.name, meaning, what, changes, extra=of_state(state.name, meaning, remedy))
         self._logged, self._left_out = (state, reason), 0
         self._lines += 1

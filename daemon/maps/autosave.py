@@ -242,7 +242,7 @@ class MapAutosaver:
         try:
             threading.Thread(target=work, name="lumiloop-map", daemon=True).start()
         except Exception:  # no memory, or no thread: the next attempt comes soon
-            log.exception("the map folder cannot be read")
+            log.exception("the map folder cannot be checked")
             self._busy(False)
 
     def _looked(self, store: Store, before: str) -> None:
@@ -251,7 +251,7 @@ class MapAutosaver:
         if self.error == before:
             self.error = store.trouble
         if not store.trouble:
-            log.info("maps can be stored in %s again", store.folder)
+            log.info("maps can be stored in %s from now on", store.folder)
         self._go_on()
 
     def _begin(self, store: Store, state: State, end: End) -> None:

@@ -150,7 +150,7 @@ class View:
             most = largest(waiting.values())
             oldest = next(one for one, peer in waiting.items() if host_of(peer) == most)
             del waiting[oldest]
-            await _refuse(oldest, "words", "Other clients connected first.")
+            await _refuse(oldest, "words", "Too many pages connected before this one sent its token.")
         waiting[socket] = host
         try:
             return await self._authenticate(socket, host)

@@ -97,7 +97,7 @@ class CommandClient(asyncio.DatagramProtocol):
         return ours, acknowledged == number and outcome is not Outcome.RUNNING, outcome
 
     async def wait_for_end(self, written: bytes, map_id: bytes = b"", longest_s: float = LONGEST_S) -> str:
-        """Poll until the command ends: its outcome in lower case, ``replaced``, or ``no end seen`` after that time.
+        """Poll until the command ends: its outcome in lower case, ``replaced``, or ``no result received`` in that time.
 
         Raises:
             CommandRefused: the server does not answer.

@@ -14,7 +14,7 @@ from hal.net.peers import most_of
 log = logging.getLogger(__name__)
 
 MAX_CONNECTIONS: Final = 32
-STRANGE: Final = "sends data that is not a Modbus request; the daemon drops it and closes the connection"
+STRANGE: Final = "sends data that is not a Modbus request; the daemon ignores it, and closes a TCP connection"
 PER_HOST: Final = most_of(MAX_CONNECTIONS)
 """Connections that one host may have."""
 GREEDY: Final = f"is rejected, because it uses {PER_HOST} of the {MAX_CONNECTIONS} connections; close one"

@@ -28,7 +28,7 @@ SCHEMA: Final = 1
 LATEST: Final = {
     "pose": "after each cycle: the snapshot, with the meaning of the state",
     "lights": "after each cycle: the light solution, with every link",
-    "scan": "each scan: ranges in m as little-endian float32, NaN without a return",
+    "scan": "each scan: ranges in m as little-endian float32; inf: no echo, NaN: no valid range",
     "statistics": "once a second: counters and times of cycle, devices and process",
 }
 """Topics of which a slow client receives the latest message only."""

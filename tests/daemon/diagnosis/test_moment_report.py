@@ -56,13 +56,14 @@ def test_of_a_second_in_which_nothing_changes_its_first_cycle_is_told() -> None:
 def test_lamps_that_do_not_fit_the_place_dissent_though_what_is_left_agrees(against: int, word: str) -> None:
     links = tuple(LightLink(k, k, LinkUse.REJECTED if k < against else LinkUse.ACCEPTED, 1e-9, 0.5) for k in range(5))
     picture = LightPicture(LightFix.GOOD, 5 - against, 1.0, (1.0, 2.0, 0.0), links=links)
-    shown = replace(NOTHING, pose=(1.0, 2.02, 0.0), light=picture, trust=Trust(gap=0.04))
+    shown = replace(NOTHING, pose=(1.0, 2.02, 0.0), light=picture, trust=Trust(0.3, gap=0.04, laser=True, wheels=True))
     moment = Moment(0.0, State.DEGRADED, shown, None, None, True, None, 0, ())
     said = report([moment], 0.0, "here", 0.1)
     line = next(line for line in said.splitlines() if line.startswith("  light "))
     assert f"light    {word}: its position is 0.02 m" in line
     assert (f"{against} are inconsistent with the pose" in line) is (against > 0)
     assert "fits again" not in said
+    assert "protection level 0.30 m by lidar, odometry" in said
 
 
 @pytest.mark.filterwarnings("error")

@@ -83,7 +83,7 @@ def test_a_folder_that_has_become_free_is_no_fault_any_more_though_there_is_noth
 
     with caplog.at_level(logging.INFO):
         asyncio.run(run())
-    assert f"maps can be stored in {tmp_path} again" in caplog.text
+    assert f"maps can be stored in {tmp_path} from now on" in caplog.text
 
 
 async def test_what_is_wrong_with_the_folder_may_change(tmp_path: Path) -> None:

@@ -24,7 +24,9 @@ async def test_who_says_nothing_takes_no_viewer_s_place(tmp_path: Path, monkeypa
         silent = [await house.session.ws_connect(f"{house.address}/ws") for _ in range(8)]
         async with house.page(TOKEN) as page:
             assert (await page.welcome())["kind"] == "welcome"
-        assert (await silent[0].receive_json(timeout=5.0))["text"] == "Other clients connected first."
+        assert (await silent[0].receive_json(timeout=5.0))[
+            "text"
+        ] == "Too many pages connected before this one sent its token."
         assert not silent[-1].closed
         for one in silent:
             await one.close()
