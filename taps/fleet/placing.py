@@ -16,7 +16,7 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
-from daemon.config.paths import state_folder, stored_maps
+from daemon.config.paths import stored_maps
 from daemon.config.schema import Config
 from daemon.config.survey_loader import SurveyError, dump, read_survey
 from daemon.maps.container import BadMap
@@ -138,10 +138,10 @@ class Installed(Held, frozen=True):
 
 
 class Records:
-    """Records of the installed files, in a file of the state directory; read again after a change."""
+    """Records of the installed files, in a file beside the folder of maps; read again after a change."""
 
     def __init__(self, path: Path | None = None) -> None:
-        self.path = path or state_folder() / RECORD
+        self.path = path or stored_maps("").parent / RECORD
         self._read: tuple[int, dict[str, Installed]] = -1, {}
 
     def taken(self) -> dict[str, Installed]:

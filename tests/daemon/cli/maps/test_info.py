@@ -15,7 +15,7 @@ from daemon.config import paths
 from daemon.config.schema import Config
 from daemon.maps import edit
 from daemon.system import console
-from taps.fleet.placing import MAP, target_path
+from taps.fleet.placing import MAP, RECORD, Records, target_path
 from tests.daemon.support.map_maker import Shape, content
 
 ROOT = Path(__file__).parents[4]
@@ -76,6 +76,7 @@ def test_the_maps_of_the_service_are_meant_where_this_user_keeps_none(
     assert paths.stored_maps("") == service
     assert paths.stored_maps("/maps") == Path("/maps")
     assert edit.keep(Config(), content(), 0x1234).parent == service == target_path(MAP, Config(), None)
+    assert Records().path == tmp_path / "service" / RECORD, "where the service of the fleet reads it"
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lumiloop.toml").write_text("")
     assert parser.main(["map", "info"]) == console.OK
