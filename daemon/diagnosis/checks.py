@@ -270,7 +270,11 @@ def maps(case: Case) -> Iterator[Finding]:
     if found is Maps.TAKEN and not case.runs:
         yield fix("maps", text, "end that process, or name another folder in `map.folder`")
     elif found in (Maps.BROKEN, Maps.FROZEN):
-        yield fix("maps", text, "give this user write access, or name another folder in `map.folder`")
+        yield fix(
+            "maps",
+            text,
+            "give this user write access, move unusable files away, or name another folder in `map.folder`",
+        )
     elif settings.map.localise and found is not Maps.READY:
         yield fix("maps", f"{text}; `map.localise` requires a map", "make a map first, or set map.localise = false")
     else:
