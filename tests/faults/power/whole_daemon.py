@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from daemon.maps.generations import problem_of
 from daemon.publish.modbus.client import NoAnswer, Reader
 from daemon.runtime.warmup import load
 from estimator import CACHE_DIR
@@ -69,14 +70,16 @@ def furnish(disk: Path) -> None:
     kernels = disk / "kernels" / CACHE_DIR.name
     shutil.copytree(CACHE_DIR, kernels)
     for pattern in COMPILED:
-        for found in [*(kernels / "numerics_estimator").glob(pattern)]:
-            found.unlink()
+        found = [*(kernels / "numerics_estimator").glob(pattern)]
+        assert found, f"{pattern}: no kernel is missing, and none is compiled"
+        for path in found:
+            path.unlink()
     (disk / "state").mkdir()
 
 
 def maps(disk: Path) -> int:
-    """Number of maps that are stored."""
-    return len(list((disk / "state").rglob("*.lumimap")))
+    """Number of stored maps that can be used."""
+    return sum(problem_of(path) is None for path in (disk / "state").rglob("*.lumimap"))
 
 
 def main(cuts: int, work: Path) -> list[str]:
