@@ -28,7 +28,7 @@ def main(args: argparse.Namespace) -> int:
         head = [
             f"Lamps located by the drive {drive.path.name}. The frame is that of its map: origin at the start "
             "pose, x ahead.",
-            "Height: " + ("as given." if args.height else "from the drive." if found.height_told else "a guess."),
+            "Height: " + ("as given." if args.height else "from the drive." if found.height_told else "a default."),
         ]
         write_survey(args.out, found.found.survey, head, remarks(found), force=args.force)
         sys.stdout.write(f"written: {args.out}\n{draw_survey(found, args.out.with_suffix('.png'))}\n")

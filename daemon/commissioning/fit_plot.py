@@ -25,7 +25,7 @@ def draw_calibration(found: Calibrated, path: Path) -> str:
     way = np.hypot(*(there - at).T)
     for n, (title, values) in enumerate((("before", found.before), ("after", found.after))):
         axes = canvas.add_subplot(1, 2, n + 1)
-        axes.scatter(way[~found.used], 100.0 * values[~found.used], s=2, color="0.8", label="left out")
+        axes.scatter(way[~found.used], 100.0 * values[~found.used], s=2, color="0.8", label="not used")
         axes.scatter(way[found.used], 100.0 * values[found.used], s=2, c=found.rows.lamp[found.used], cmap="tab20")
         axes.set(title=title, xlabel="distance from below the lamp, m", ylim=(-60.0, 60.0))
         axes.axhline(0.0, color="k", linewidth=0.5)
@@ -83,4 +83,4 @@ def _save(canvas: Any, path: Path) -> str:
         canvas.savefig(path)
     except OSError as error:
         return f"no plot: cannot write {path}: {error.strerror}"
-    return f"picture: {path}"
+    return f"plot: {path}"

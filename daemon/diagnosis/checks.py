@@ -300,7 +300,7 @@ def survey(case: Case) -> Iterator[Finding]:
     except SurveyError as error:
         named = naming(case.file, "lights.survey", path)
         there = os.path.exists(path)  # noqa: PTH110  Path.exists raises where no file can have that name
-        remedy = "mend it" if there else "create the file, or name another"
+        remedy = "correct the file" if there else "create the file, or name another"
         yield fix("survey", f"{error} ({named})", f"{remedy}; then run `lumiloop check`")
         return
     unused = "" if settings.photodiode.fitted else ", not used: photodiode.bus is empty"

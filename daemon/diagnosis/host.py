@@ -213,4 +213,4 @@ async def _listen(path: Path) -> Heard | str:
                             why = getattr(frame, "text", "")
             except NotTheStream as error:
                 why = str(error)
-    return heard if heard.pid else why or "nobody answers"
+    return heard if heard.pid else why or "no reply"

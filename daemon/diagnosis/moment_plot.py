@@ -179,7 +179,7 @@ def _wheels(axes: Any, told: Sequence[Moment], seconds: Array) -> None:
         return
     odd = np.array([said is not None and not said.agree for said in both])
     dots = (
-        axes.plot(seconds[odd], np.array(metres)[odd], ".", color="tab:red", label="they dissent") if odd.any() else []
+        axes.plot(seconds[odd], np.array(metres)[odd], ".", color="tab:red", label="they disagree") if odd.any() else []
     )
     _two_scales(axes, seconds, ("odometry minus lidar, m", metres), ("degrees", turned), dots)
 

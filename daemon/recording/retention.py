@@ -180,7 +180,7 @@ class Flight:
                 self._folder / state_name(begun.number), begun.header, begun.line, nodes, breathe
             )
         except (OSError, CannotTake) as error:
-            self._fail("the state of the estimator", error)
+            self._fail("a checkpoint", error, "; the recording replays from an older one")
             self._prune(begun.t_mono)
             return
         segment.state = True
@@ -188,12 +188,10 @@ class Flight:
         self.error = ""
         self._prune(begun.t_mono)
 
-    def _fail(self, what: str, error: Exception) -> None:
+    def _fail(self, what: str, error: Exception, follows: str = "") -> None:
         said = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
         if not self.error:
-            log.error(
-                "%s cannot be stored in %s: %s; the recording replays from an older one", what, self._folder, said
-            )
+            log.error("%s cannot be stored in %s: %s%s", what, self._folder, said, follows)
         self.error = f"{what}: {said}"
 
     def _take_away(self, number: int, path: Path) -> None:

@@ -35,7 +35,7 @@ def show(args: argparse.Namespace) -> int:
         return console.fail(str(error), console.USAGE)
     head = [f"configuration: {source}"]
     if source.file is None:
-        head += ["looked for:", *(f"  {path} ({how})" for path, how in discovery.places())]
+        head += ["searched:", *(f"  {path} ({how})" for path, how in discovery.places())]
     head += [f"--set {override}" for override in args.set]
     sys.stdout.write("".join(f"# {line}\n" for line in head) + "\n" + loader.dump(settings))
     return console.OK

@@ -114,7 +114,7 @@ def test_show_says_where_it_looked(
     monkeypatch.delenv("LUMILOOP_CONFIG")
     assert parser.main(["config", "show"]) == console.OK
     said = capsys.readouterr().out
-    assert said.startswith("# configuration: built-in values; no file was found\n# looked for:\n#   lumiloop.toml (")
+    assert said.startswith("# configuration: built-in values; no file was found\n# searched:\n#   lumiloop.toml (")
     assert tomllib.loads(said)["name"] == "lumiloop"
 
 
