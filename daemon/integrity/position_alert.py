@@ -54,8 +54,8 @@ class Alarm:
     Attributes:
         on: the alert is raised. With a limit it is raised until the first protection level is within it: missing
             information must not look like a good state. said: it has been logged. It is not logged before the level was
-            within the limit, or had the time to get there. Without a protection level, as during relocalisation, state
-            and reason suffice.
+            within the limit, or had the time to get there. Before the first protection level of a run, state and reason
+            suffice.
     """
 
     def __init__(self, limit_m: float = 0.0) -> None:

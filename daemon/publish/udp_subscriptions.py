@@ -228,5 +228,5 @@ class Subscriptions:
             if (answer := self.leases.answer((peer, source), message, now)) is not None:
                 self._send(sock, encode(answer), peer, source)
             if (count := len(self.leases)) != before:
-                last = f"last subscriber {peer[0]}:{peer[1]}"
+                last = f"latest request from {peer[0]}:{peer[1]}"
                 self._lines.say(now, logging.INFO, f"pose datagrams: {count} subscribers, {last}")

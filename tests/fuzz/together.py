@@ -131,6 +131,7 @@ class Attack:
         self.over.set()
         for thread in self._threads:
             thread.join(REPLAY_S)
+        self.broken += [f"{thread.name} does not end" for thread in self._threads if thread.is_alive()]
 
 
 def to_stream(family: socket.AddressFamily, address: Any) -> Send:
@@ -272,27 +273,33 @@ def robot(folder: Path) -> Iterator[tuple[Attack, Reader, dict[str, int]]]:
         children |= {name: start(name, "daemon", *words) for name, words in taps.items()}
         simulator.send_signal(signal.SIGUSR1)
         time.sleep(5.0)
-        stream, fleet = stream_path("together"), stack.enter_context(zenoh.open(session_config("client", router)))
+        fleet = stack.enter_context(zenoh.open(session_config("client", router)))
         stack.callback(attack.end)
-        modbus, asked, udp, bus = target("modbus"), target("stream"), target("udp"), target("bus")
-        inet, unix = socket.AF_INET, socket.AF_UNIX
-        attack.begin("modbus tcp", to_stream(inet, ("127.0.0.1", ports["modbus"])), modbus.seeds(), modbus.mend)
-        attack.begin("modbus udp", to_datagrams(ports["modbus"]), modbus.seeds(), modbus.mend)
-        attack.begin("modbus line", to_line(rtu), modbus.seeds())
-        attack.begin("odometry", to_datagrams(ports["odometry"]), udp.seeds(), udp.mend)
-        attack.begin("subscriptions", to_datagrams(ports["pose"]), udp.seeds(), udp.mend)
-        attack.begin("stream", to_stream(unix, str(stream)), asked.seeds(), asked.mend)
-        attack.begin("commands", to_stream(unix, str(commands_beside(stream))), ORDERS)
-        attack.begin("i2c server", to_stream(unix, str(folder / BUS)), bus.seeds(), bus.mend)
-        attack.begin("view", to_stream(inet, ("127.0.0.1", ports["view"])), PAGES)
-        attack.begin("metrics", to_stream(inet, ("127.0.0.1", ports["metrics"])), PAGES)
-        attack.begin("foxglove", to_stream(inet, ("127.0.0.1", ports["foxglove"])), FRAMES)
-        attack.begin("fleet", to_fleet(fleet), fleet_seeds())
-        kept = target("log").seeds()
-        attack.go(partial(replays, kept, folder, attack))
+        attack_all(attack, folder, ports, to_line(rtu), to_fleet(fleet))
         yield attack, reader, {name: child.pid for name, child in children.items()}
         ended = [name for name, child in children.items() if child.poll() is not None]
         attack.broken += [f"{name} ended" for name in ended]
+
+
+def attack_all(attack: Attack, folder: Path, ports: dict[str, int], rtu: Send, fleet: Send) -> None:
+    """Damage at every door, and damaged recordings."""
+    stream = stream_path("together")
+    modbus, asked, udp, bus = target("modbus"), target("stream"), target("udp"), target("bus")
+    inet, unix = socket.AF_INET, socket.AF_UNIX
+    attack.begin("modbus tcp", to_stream(inet, ("127.0.0.1", ports["modbus"])), modbus.seeds(), modbus.mend)
+    attack.begin("modbus udp", to_datagrams(ports["modbus"]), modbus.seeds(), modbus.mend)
+    attack.begin("modbus line", rtu, modbus.seeds())
+    attack.begin("odometry", to_datagrams(ports["odometry"]), udp.seeds(), udp.mend)
+    attack.begin("subscriptions", to_datagrams(ports["pose"]), udp.seeds(), udp.mend)
+    attack.begin("stream", to_stream(unix, str(stream)), asked.seeds(), asked.mend)
+    attack.begin("commands", to_stream(unix, str(commands_beside(stream))), ORDERS)
+    attack.begin("i2c server", to_stream(unix, str(folder / BUS)), bus.seeds(), bus.mend)
+    attack.begin("view", to_stream(inet, ("127.0.0.1", ports["view"])), PAGES)
+    attack.begin("metrics", to_stream(inet, ("127.0.0.1", ports["metrics"])), PAGES)
+    attack.begin("foxglove", to_stream(inet, ("127.0.0.1", ports["foxglove"])), FRAMES)
+    attack.begin("fleet", fleet, fleet_seeds())
+    kept = target("log").seeds()
+    attack.go(partial(replays, kept, folder, attack))
 
 
 def fleet_seeds() -> list[bytes]:

@@ -81,8 +81,8 @@ POINTS: Final = (
         for k in range(FAULTS)
     ),
     *(
-        Point(f"restarts_{part.name.lower()}", f"restarts, {part.name}", U16, _restarts(part), f"{text.capitalize()}.",
-              rule=Rule.WRAP, can_be_unknown=False)
+        Point(f"restarts_{part.name.lower()}", f"restarts, {part.name}", U16, _restarts(part),
+              f"{text[0].upper()}{text[1:]}.", rule=Rule.WRAP, can_be_unknown=False)
         for part, text in PARTS.items()
     ),
     Point("down", "components that are down", U16, _bits("down"),

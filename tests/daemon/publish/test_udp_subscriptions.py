@@ -304,5 +304,5 @@ def test_one_who_comes_and_goes_does_not_fill_the_log(caplog: pytest.LogCaptureF
     caplog.set_level("INFO")
     run_virtual(body())
     assert [record.message for record in caplog.records] == [
-        "pose datagrams: 1 subscribers, last subscriber 192.0.2.7:4000"
+        "pose datagrams: 1 subscribers, latest request from 192.0.2.7:4000"
     ]
