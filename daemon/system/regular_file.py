@@ -11,7 +11,7 @@ import os
 import stat
 import time
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 TRIES: Final = 3
 PAUSE_S: Final = 0.05
@@ -25,6 +25,7 @@ LASTING: Final = frozenset(
 """Errors that another try does not change."""
 OPEN_ALREADY: Final = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/")
 """Paths of what the caller has opened, as a shell does for ``<(command)``: a pipe is welcome there."""
+_PIECE: Final = 1 << 20
 _KINDS: Final = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
 
 
@@ -49,7 +50,7 @@ def read_named(path: Path, most_bytes: int) -> bytes:
     if not str(path).startswith(OPEN_ALREADY):
         return read_regular(path, most_bytes)
     with path.open("rb") as file:
-        content = file.read(most_bytes + 1)
+        content = _read_up_to(most_bytes + 1, file, 0)
     return _bounded(path, content, len(content), most_bytes)
 
 
@@ -60,10 +61,22 @@ def _read(path: Path, most_bytes: int) -> bytes:
         about = os.fstat(handle)
         _must_be_regular(path, about.st_mode)
         with os.fdopen(handle, "rb", closefd=False) as file:
-            content = b"" if about.st_size > most_bytes else file.read(most_bytes + 1)
+            content = b"" if about.st_size > most_bytes else _read_up_to(most_bytes + 1, file, about.st_size)
     finally:
         os.close(handle)
     return _bounded(path, content, max(about.st_size, len(content)), most_bytes)
+
+
+def _read_up_to(most: int, file: BinaryIO, size: int) -> bytes:
+    """Read to the end, but no more than ``most`` bytes; ``size``: as stated, which a file of /proc or a pipe does not.
+
+    The buffer has the size of the file: one of ``most`` bytes could exceed a memory limit.
+    """
+    parts, piece = [], size + 1
+    while most > 0 and (part := file.read(min(most, piece))):
+        parts.append(part)
+        most, piece = most - len(part), _PIECE
+    return b"".join(parts)
 
 
 def _must_be_regular(path: Path, mode: int) -> None:

@@ -40,6 +40,18 @@ def test_a_file_that_is_too_large_is_refused(tmp_path: Path) -> None:
         read_regular(Path("/proc/self/status"), 10)  # a file that states no size
 
 
+def test_a_small_file_needs_no_memory_for_the_largest(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(bytes(3 << 20))
+    assert read_regular(file, 1 << 50) == bytes(3 << 20)
+    assert read_regular(Path("/proc/self/status"), 1 << 50)
+    reader, writer = os.pipe()
+    os.write(writer, b"piped")
+    os.close(writer)
+    assert read_named(Path(f"/dev/fd/{reader}"), 1 << 50) == b"piped"
+    os.close(reader)
+
+
 @pytest.mark.parametrize("number", [errno.EIO, errno.EACCES, errno.EMFILE, errno.ENOMEM, errno.ENOSPC])
 def test_a_failure_that_passes_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     file, calls, really = tmp_path / "file", [0], os.open
