@@ -19,8 +19,7 @@ def write_whole(path: Path, content: bytes) -> None:
     """
     beside = path.with_name(f".{path.name}.part")
     try:
-        beside.unlink(missing_ok=True)  # of a killed process
-        with os.fdopen(os.open(beside, _NEW, 0o666), "wb") as file:
+        with os.fdopen(_new_file(beside), "wb") as file:
             _give_to_owner(file.fileno(), path.parent)
             file.write(content)
             file.flush()
@@ -31,6 +30,15 @@ def write_whole(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
         raise
+
+
+def _new_file(path: Path) -> int:
+    """Make a file, in place of what a killed process has left there; return its descriptor."""
+    try:
+        return os.open(path, _NEW, 0o666)
+    except FileExistsError:
+        path.unlink(missing_ok=True)
+        return os.open(path, _NEW, 0o666)
 
 
 def _give_to_owner(handle: int, folder: Path) -> None:
