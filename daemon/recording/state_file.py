@@ -24,7 +24,7 @@ import msgspec
 
 from daemon.recording.state_schema import VERSION, Array, Blob, End, Node, count_of
 from daemon.system.atomic_file import sync_folder
-from daemon.system.regular_file import read_regular
+from daemon.system.regular_file import read_regular, read_start
 
 MAGIC: Final = b"LUMISTAT"
 BLOCK_BYTES: Final = 256 << 10
@@ -142,8 +142,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], bytes, Iterator[Node]]:
 
 def read_header(path: Path) -> dict[str, Any]:
     """Returns the header alone; raises as :func:`read_state` does."""
-    with path.open("rb") as file:
-        return _header(path, file.read(1 << 20))[0]
+    return _header(path, read_start(path, 1 << 20))[0]
 
 
 def _header(path: Path, data: bytes) -> tuple[dict[str, Any], int]:

@@ -45,6 +45,14 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     return _read(path, most_bytes)
 
 
+def read_start(path: Path, most_bytes: int) -> bytes:
+    """First ``most_bytes`` of a regular file; raises `OSError` where it is not one, or cannot be read."""
+    _must_be_regular(path, path.stat().st_mode)
+    with open(path, "rb", opener=_without_waiting) as file:
+        _must_be_regular(path, os.fstat(file.fileno()).st_mode)
+        return file.read(most_bytes)
+
+
 def read_named(path: Path, most_bytes: int) -> bytes:
     """As :func:`read_regular`, for a file that an operator names: it may also be a pipe that is open already."""
     if not str(path).startswith(OPEN_ALREADY):
@@ -56,7 +64,7 @@ def read_named(path: Path, most_bytes: int) -> bytes:
 
 def _read(path: Path, most_bytes: int) -> bytes:
     _must_be_regular(path, path.stat().st_mode)  # before it is opened, which may start a device
-    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    handle = _without_waiting(path)
     try:
         about = os.fstat(handle)
         _must_be_regular(path, about.st_mode)
@@ -65,6 +73,10 @@ def _read(path: Path, most_bytes: int) -> bytes:
     finally:
         os.close(handle)
     return _bounded(path, content, max(about.st_size, len(content)), most_bytes)
+
+
+def _without_waiting(path: str | Path, flags: int = os.O_RDONLY) -> int:
+    return os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
 
 
 def _read_up_to(most: int, file: BinaryIO, size: int) -> bytes:

@@ -14,7 +14,7 @@ from daemon.config.survey_loader import SurveyError, read_survey
 from daemon.devices.sample_clock import FILE, SampleClock
 from daemon.maps import last_pose
 from daemon.system import regular_file
-from daemon.system.regular_file import TRIES, read_named, read_regular
+from daemon.system.regular_file import TRIES, read_named, read_regular, read_start
 from tests.daemon.support.odd_files import KINDS, planted
 
 
@@ -28,6 +28,8 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, kind: str) -
     planted(tmp_path / "file", kind)
     with pytest.raises(OSError, match=r"not a regular file|Too many levels|Is a directory"):
         read_regular(tmp_path / "file", 100)
+    with pytest.raises(OSError, match=r"not a regular file|Too many levels|Is a directory"):
+        read_start(tmp_path / "file", 100)
 
 
 def test_a_file_that_is_too_large_is_refused(tmp_path: Path) -> None:
@@ -36,6 +38,7 @@ def test_a_file_that_is_too_large_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="larger than 100 bytes"):
         read_regular(file, 100)
     assert read_regular(file, 101) == bytes(101)
+    assert read_start(file, 100) == bytes(100)
     with pytest.raises(OSError, match="larger than 10 bytes"):
         read_regular(Path("/proc/self/status"), 10)  # a file that states no size
 
