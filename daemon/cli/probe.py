@@ -17,11 +17,10 @@ from hal.photodiode.probe import BusFinding, Chip, probe_bus
 from hal.port.opening import open_port
 
 NOTHING = (
-    "nothing to look at: no serial device that may be a HOKUYO is plugged in, and there is no I2C bus\n"
-    "  plug the sensor in and give it power; an Ethernet model is not searched for, name it:\n"
-    "  lumiloop probe tcp://192.168.0.10:10940\n"
-    "  a photodiode's bus may have to be enabled first; one that is served elsewhere is named like\n"
-    "  lumiloop probe unix:/run/lumiloop/i2c\n"
+    "no sensor to examine: this computer has no serial device that may be a HOKUYO, and no I2C bus\n"
+    "  USB lidar: connect it and switch it on\n"
+    "  Ethernet lidar: name its address, as in `lumiloop probe tcp://192.168.0.10:10940`\n"
+    "  photodiode: enable the I2C bus, or name a bus server, as in `lumiloop probe unix:/run/lumiloop/i2c`\n"
 )
 
 Found = Finding | BusFinding

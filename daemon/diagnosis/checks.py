@@ -28,6 +28,7 @@ FREE_BYTES: Final = 200 << 20
 FIRST_UTC: Final = 1_735_689_600.0
 """Start of 2025, s of UTC: an earlier calendar means that the clock was never set."""
 GROUPS: Final = {"i2c": "i2c", "tty": "dialout"}
+NOT_RUNNING: Final = "start it with `lumiloop run` or as a service; the log states why it ended"
 
 
 class Level(IntEnum):
@@ -311,7 +312,7 @@ def daemon(case: Case) -> Iterator[Finding]:
     """Reports state and faults of the running daemon, with their remedies."""
     heard = case.heard
     if isinstance(heard, str):
-        yield remark("daemon", f"no daemon runs with the name {case.settings.name} ({heard})", "read its log")
+        yield remark("daemon", f"no daemon runs with the name {case.settings.name} ({heard})", NOT_RUNNING)
         return
     if isinstance(heard, Mute):
         yield fix("daemon", heard.text, heard.remedy)

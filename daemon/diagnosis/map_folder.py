@@ -59,7 +59,7 @@ def look_at_maps(settings: Config) -> tuple[Maps, str]:
     unwritten = not settings.map.localise and not os.access(folder, os.W_OK | os.X_OK)
     other = "" if settings.map.localise else _keeper(folder)
     more = "; this user cannot write to it (fault 403)" if unwritten else ""
-    more += f"; {other} stores its maps there, and only one process can (fault 403)" if other else ""
+    more += f"; {other} stores its maps there, so a second daemon would report fault 403" if other else ""
     if start is None:
         broken = store.refused or unwritten
         text = f"{folder}: {'no map in it can be used' if store.refused else 'no map in it yet'}{more}"

@@ -61,16 +61,16 @@ def _named(utc: float, wide: float) -> tuple[str, str]:
     """Returns the printed form of a second that begins at ``utc`` and lasts ``wide``, s, and its description."""
     if utc.is_integer():
         return clock(utc, whole=True), "the whole second"
-    return clock(utc), "the second from then" if wide >= SECOND_S else "the rest of that second"
+    return clock(utc), "the second after it" if wide >= SECOND_S else "the rest of that second"
 
 
 def _change(after_s: float, changed: int | None) -> str:
     """Describes the reported change of a whole second; ``after_s``: from its end, negative within it."""
     if changed is None:
-        return "nothing changes"
+        return "no change of state, reason or faults in it"
     if after_s < 0.0:
         return "first change of state, reason or faults in it"
-    return f"nothing changes in it; state, reason or faults change {after_s:.2f} s after it"
+    return f"no change of state, reason or faults in it; a change {after_s:.2f} s after it"
 
 
 def _state(told: Sequence[Moment], k: int) -> Iterator[str]:

@@ -89,12 +89,12 @@ FAULTS: Final[dict[Fault, tuple[str, str]]] = {
         "check whether the robot was moved by hand or is outside the mapped area; check the lidar's window and mount",
     ),
     Fault.LIDAR_TURNED: (
-        "the lidar is not mounted as configured",
+        "the mount of the lidar differs from `lidar.mount`, which is corrected in the pose",
         "measure the mount, or record a drive and run `lumiloop calibrate --lidar-mount`; then correct `lidar.mount`",
     ),
     Fault.LIDAR_FROZEN: (
-        "the lidar repeats one scan while the robot moves; odometry and light carry the pose",
-        "power it off and on; check what relays its scans, if something does",
+        "the lidar repeats one scan while the robot moves; the pose uses odometry and light",
+        "power it off and on; restart a driver or gateway that passes its scans on",
     ),
     Fault.ADC_BUS_MISSING: (
         "the photodiode's I2C bus is not found",

@@ -43,7 +43,10 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
         "check the lidar's power and cable",
     ),
     Reason.UNPROVED: ("the pose follows the lidar; it is not confirmed yet", "wait, or drive a metre or two"),
-    Reason.AXIS_UNKNOWN: ("the surroundings do not determine every axis of the pose", "read the known-axis bits"),
+    Reason.AXIS_UNKNOWN: (
+        "the surroundings do not determine every axis of the pose",
+        "use only the known axes and drive on; if it persists, send wheel odometry or add lamps",
+    ),
     Reason.MATCH_FAILED: (
         "scans do not match the map; the pose is extrapolated",
         "check whether the lidar is covered, lifted or surrounded by people",

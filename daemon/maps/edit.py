@@ -27,6 +27,8 @@ from daemon.system.regular_file import read_named
 Array = npt.NDArray[np.float64]
 
 LONGEST_NAME: Final = 64
+BESIDE: Final = "stop the daemon, or copy a map of --out FILE there and run `lumiloop switch-map FILE`"
+"""Remedy where the folder of a new map is in use."""
 LEAST_APART_M: Final = 1.0
 """Smallest distance of two points in m that determines a rotation."""
 TOLERANCE_M, TOLERANCE = 0.1, 0.01
@@ -82,7 +84,7 @@ def keep(settings: Config, content: bytes, map_id: int) -> Path:
     try:
         return store.save(content, map_id)
     except OSError as error:
-        raise OSError(f"{store.folder}: {said(error)}; stop the daemon, or name --out FILE") from error
+        raise OSError(f"{store.folder}: {said(error)}; {BESIDE}") from error
     finally:
         store.close()
 

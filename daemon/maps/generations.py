@@ -30,7 +30,7 @@ OTHERS: Final = 7
 """Number of other maps of which the newest good generation is kept."""
 Problem = BadMap | OSError | MemoryError
 """Reason why a map file cannot be used."""
-OLDER: Final = "an older generation"
+OLDER: Final = "newer files of this map are kept"
 CROWDED: Final = f"{OTHERS} maps of other areas are newer"
 
 

@@ -347,7 +347,7 @@ class Store:
 
     def _let_go(self, map_id: int) -> None:
         for generation, why in list(superfluous(self.generations(), map_id, self._origin, self._examined)):
-            log.log(logging.WARNING if why == CROWDED else logging.INFO, "%s goes: %s", generation.path, why)
+            log.log(logging.WARNING if why == CROWDED else logging.INFO, "%s is deleted: %s", generation.path, why)
             try:
                 generation.path.unlink(missing_ok=True)
             except OSError as error:

@@ -143,7 +143,7 @@ class MapSwitch:
             return f"{store.folder}: {said(error)}"
         if map_id not in there:
             named = ", ".join(f"{one:08x}" for one in sorted(there)) or "none"
-            return f"no map {map_id:08x} in {store.folder}; available maps: {named}"
+            return f"no map {map_id:08x} in {store.folder} (copy its file there); available maps: {named}"
         if (reason := await self._saved()) not in NOTHING_TO_SAVE:
             return f"the map in use cannot be saved: {reason}"
         try:

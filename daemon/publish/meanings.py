@@ -20,7 +20,7 @@ STATES: Final[dict[State, str]] = {
 USES: Final[dict[LinkUse, str]] = {
     LinkUse.OTHER: "not known to this version",
     LinkUse.ACCEPTED: "used",
-    LinkUse.OCCLUDED: "weaker than expected here: an object blocks the light",
+    LinkUse.OCCLUDED: "weaker than expected here: an object blocks the light; or it fits for less than 0.5 s or 0.15 m",
     LinkUse.REJECTED: "stronger than expected here, or not where the survey has it: moved or exchanged",
     LinkUse.RIM: "at the edge of the receiver's field of view",
     LinkUse.FAINT: "not above the noise",

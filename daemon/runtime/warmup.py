@@ -150,7 +150,7 @@ def load_aloud(say: Callable[[str], None], what: str, work: Callable[[], object]
     except (OSError, RuntimeError) as error:
         raise CannotLoad(f"kernels cannot be loaded: {error}") from error
     if count := len(_compiled() - before):
-        say(f"{count} kernels compiled in {time.monotonic() - begun:.0f} s; later starts load them in about a second")
+        say(f"kernels compiled: {count}, in {time.monotonic() - begun:.0f} s; later starts load them in about a second")
 
 
 def _import(module: str) -> None:
@@ -169,7 +169,7 @@ def _announced(say: Callable[[str], None], before: set[Path]) -> Iterator[None]:
     def look() -> None:
         while not done.wait(LOOK_S):
             if _compiled() - before:
-                say("first start of this version: the daemon compiles its kernels, which takes a minute or more")
+                say("compiling numerical kernels, once for each version (up to two minutes)")
                 return
 
     looking = threading.Thread(target=look, name="lumiloop-compiling", daemon=True)

@@ -51,5 +51,5 @@ def change(args: argparse.Namespace) -> int:
         loader.write_back(source.file, values)
     except loader.ConfigError as error:
         return console.fail(str(error), console.USAGE)
-    sys.stdout.write(f"written: {source.file}\n")
+    sys.stdout.write(f"written: {source.file}; a running daemon uses it after a restart\n")
     return console.OK

@@ -92,7 +92,7 @@ def map_id_of(text: str) -> int:
     except ValueError:
         number = -1
     if not 0 < number < 1 << 32:
-        raise ValueError(f"{text}: not a map; give eight hexadecimal digits (`lumiloop map info FILE`) or a file")
+        raise ValueError(f"{text}: not a map; give eight hexadecimal digits (`lumiloop map info` lists them) or a file")
     return number
 
 

@@ -213,7 +213,7 @@ def test_a_folder_that_another_daemon_has_is_said(tmp_path: Path, capsys: pytest
         assert parser.main(["check", str(file), *more]) == console.OK
         return capsys.readouterr().out
 
-    words = f"; process {os.getpid()} stores its maps there, and only one process can (fault 403)"
+    words = f"; process {os.getpid()} stores its maps there, so a second daemon would report fault 403"
     assert f"{maps}: no map in it yet{words}" in said()
     other.save(content(Shape(submaps=3, map_id=7)), 7)
     assert f"of 3 submaps is valid{words}" in said()

@@ -164,7 +164,10 @@ def test_a_whole_second_is_of_the_first_change_in_it(recorded: Path, capsys: pyt
     head, state = asked(f"{second}.0", dump, capsys).splitlines()[:2]
     assert f"{second}.000{ZONE}, cycle of" in head
     assert state.startswith("TRACKING since")
-    assert "the whole second: nothing changes, cycle of" in asked("9", dump, capsys).splitlines()[0]
+    assert (
+        "the whole second: no change of state, reason or faults in it, cycle of"
+        in asked("9", dump, capsys).splitlines()[0]
+    )
 
 
 def test_a_time_that_it_has_printed_means_the_same_cycle(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,12 +41,12 @@ def head(told: list[Moment], after: float, wide: float = 1.0) -> str:
 @pytest.mark.parametrize(
     ("after", "fault", "says"),
     [
-        ((5.5, 6.01), 6.12, "nothing changes in it; state, reason or faults change 0.12 s after it"),
-        ((5.5, 6.01), 6.2, "nothing changes, cycle of"),
-        ((5.5,), 6.95, "nothing changes in it; state, reason or faults change 0.95 s after it"),
-        ((5.5,), 7.05, "nothing changes, cycle of"),
-        ((5.5,), 6.0, "nothing changes in it; state, reason or faults change 0.00 s after it"),
-        ((5.5, 6.0), 6.3, "nothing changes, cycle of"),
+        ((5.5, 6.01), 6.12, "no change of state, reason or faults in it; a change 0.12 s after it"),
+        ((5.5, 6.01), 6.2, "no change of state, reason or faults in it, cycle of"),
+        ((5.5,), 6.95, "no change of state, reason or faults in it; a change 0.95 s after it"),
+        ((5.5,), 7.05, "no change of state, reason or faults in it, cycle of"),
+        ((5.5,), 6.0, "no change of state, reason or faults in it; a change 0.00 s after it"),
+        ((5.5, 6.0), 6.3, "no change of state, reason or faults in it, cycle of"),
         ((4.5,), 5.0, "first change of state, reason or faults in it"),
     ],
 )
@@ -56,7 +56,7 @@ def test_what_is_published_after_a_second_counts_for_as_long_as_it_may_be_of_it(
     """0.15 s, or with the first cycle, where that comes within a second."""
     told = cycles(*after, fault=fault)
     assert says in head(told, 5.0)
-    found = "nothing changes, " not in says
+    found = "no change of state, reason or faults in it, " not in says
     assert first_change(told, AT + 5.0, 1.0) == (len(after) if found else None)
     assert ("fault 101 comes" in report(told, AT + 5.0, "here", 1.0, second=True)) is found
 
@@ -85,10 +85,10 @@ def test_what_is_judged_of_a_boundary_is_what_is_printed_of_it(begun: float) -> 
 
 def test_of_a_second_of_which_a_part_is_recorded_that_part_is_told() -> None:
     """Of 22:13:25, where the recording begins at 25.4: it ends at 26, not at 26.4."""
-    assert "22:13:25.400+0000, the rest of that second: nothing changes, cycle" in head(
+    assert "22:13:25.400+0000, the rest of that second: no change of state, reason or faults in it, cycle" in head(
         cycles(5.5, 6.1, fault=6.3), 5.4, 0.6
     )
-    assert "nothing changes in it; state, reason or faults change 0.05 s after it" in head(
+    assert "no change of state, reason or faults in it; a change 0.05 s after it" in head(
         cycles(5.5, fault=6.05), 5.4, 0.6
     )
     assert "first change of state, reason or faults in it" in head(cycles(5.5, fault=5.999), 5.4, 0.6)
@@ -101,7 +101,7 @@ def test_a_second_that_does_not_begin_with_one_of_the_clock_is_named_with_its_be
     """That is a number of seconds since a recording began."""
     said = head(cycles(5.5, fault=6.3), 5.4)
     assert (
-        "22:13:25.400+0000, the second from then: first change of state, reason or faults in it, cycle of 22:13:26.300"
+        "22:13:25.400+0000, the second after it: first change of state, reason or faults in it, cycle of 22:13:26.300"
         in said
     )
     assert "22:13:25+0000, the whole second: " in head(cycles(5.5, fault=5.7), 5.0)

@@ -36,7 +36,7 @@ def test_a_fault_that_is_published_a_moment_after_the_second_of_the_journal_is_s
     late = replace(AGREED, utc=6.0 + after_s, faults=(101,))
     told = [*CYCLES[:3], late]
     said = report(told, 5.0, "here", 1.0, second=True)
-    assert f"nothing changes in it; state, reason or faults change {after_s:.2f} s after it, cycle of " in said
+    assert f"no change of state, reason or faults in it; a change {after_s:.2f} s after it, cycle of " in said
     assert "\nfault 101 since " in said
     assert "fault 101 comes" in said
     assert first_change([*told[:3], replace(AGREED, utc=6.01), replace(late, utc=6.3)], 5.0, 1.0) is None, "too late"
@@ -131,7 +131,7 @@ def test_a_moment_without_a_cycle_is_said_to_have_none() -> None:
     for second, wide in ((False, 0.1), (True, 1.0)):
         head = report([moment], 50.0, "here", wide, second).splitlines()[0]
         assert "before the first cycle, which ran 50 s later, cycle of" in head
-        assert "nothing changes" not in head
+        assert "no change of" not in head
         head = report([moment, replace(moment, utc=200.0)], 195.0, "here", wide, second).splitlines()[0]
         assert "without a cycle; the last one before ran 95 s earlier, cycle of" in head
     assert "no cycle" not in report([moment], 100.5, "here", 0.1).splitlines()[0]

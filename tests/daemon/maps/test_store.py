@@ -91,7 +91,7 @@ def test_a_good_generation_of_another_map_stays_where_the_newer_one_is_broken(
         for _ in range(2):
             store.save(content(Shape(map_id=5)), 5)
     assert names(tmp_path) == [name(4, 5), name(5, 5), name(2), name(3)]
-    assert f"{tmp_path / name(1)} goes: an older generation" in caplog.text
+    assert f"{tmp_path / name(1)} is deleted: newer files of this map are kept" in caplog.text
     assert caplog.text.count(f"{broken} cannot be used") == 1
 
 

@@ -280,8 +280,8 @@ def test_a_command_says_once_that_it_compiles(tmp_path: Path, monkeypatch: pytes
 
     for _ in range(2):
         warmup.load_aloud(say, "warm", work)
-    assert said[0].startswith("first start of this version: the daemon compiles its kernels")
-    assert said[1].startswith("1 kernels compiled in 0 s")
+    assert said[0].startswith("compiling numerical kernels, once for each version")
+    assert said[1].startswith("kernels compiled: 1, in 0 s")
     assert len(said) == 2
 
 
