@@ -26,7 +26,7 @@ def main(args: argparse.Namespace) -> int:
         found = survey(heard(drive), drive.survey.receiver, drive.survey.depth, args.height)
         sys.stdout.write(report(found, args.height))
         head = [
-            f"Lamps located by the drive {drive.path.name}. The frame is that of its map: origin at the start "
+            f"Lamps located from the recording {drive.path.name}. The frame is that of its map: origin at the start "
             "pose, x ahead.",
             "Height: " + ("as given." if args.height else "from the drive." if found.height_told else "a default."),
         ]

@@ -40,7 +40,7 @@ REASONS: Final[dict[Reason, tuple[str, str]]] = {
     Reason.LIDAR_UNREACHABLE: ("the lidar cannot be opened", "read the log, then run `lumiloop probe`"),
     Reason.LIDAR_SILENT: (
         "no valid scan for three scan periods, or scans are not steady yet",
-        "check the lidar's power and cable",
+        "read the fault; check the lidar's power and cable",
     ),
     Reason.UNPROVED: ("the pose follows the lidar; it is not confirmed yet", "wait, or drive a metre or two"),
     Reason.AXIS_UNKNOWN: (

@@ -27,7 +27,7 @@ from daemon.system.regular_file import read_named
 Array = npt.NDArray[np.float64]
 
 LONGEST_NAME: Final = 64
-BESIDE: Final = "stop the daemon, or copy a map of --out FILE there and run `lumiloop switch-map FILE`"
+BESIDE: Final = "stop the daemon, or use --out FILE, copy the file there and run `lumiloop switch-map FILE`"
 """Remedy where the folder of a new map is in use."""
 LEAST_APART_M: Final = 1.0
 """Smallest distance of two points in m that determines a rotation."""

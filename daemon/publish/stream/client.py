@@ -140,7 +140,7 @@ def _others(path: Path) -> str:
 
 def _why(error: OSError) -> str:
     if _nobody(error):
-        return "no daemon listens there; check that it runs, and read the stream's path in its log"
+        return "no daemon listens there; start `lumiloop run`, or name the stream that its log shows"
     if isinstance(error, PermissionError):
         return "access denied; the user needs access to its folder"
     return error.strerror or str(error)

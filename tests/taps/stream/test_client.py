@@ -110,7 +110,7 @@ async def test_a_daemon_that_goes_is_told_once_and_one_that_comes_is_greeted(
         async for frame in heard:
             seen.append(type(frame).__name__)
             if isinstance(frame, Lost) and len(seen) == 1:
-                assert "check that it runs" in frame.text
+                assert "start `lumiloop run`" in frame.text
                 serving = serve(path)
             elif isinstance(frame, Hello) and len(seen) == 2:
                 assert serving is not None
