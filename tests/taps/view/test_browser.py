@@ -243,12 +243,12 @@ def test_the_daemon_is_gone_and_the_page_says_so(browser: str, tmp_path: Path) -
     async def body(address: str) -> None:
         async with tab(browser, address) as page:
             await page.until("globalThis.lumiloop")
-            await page.until("document.getElementById('banner').textContent.includes('check that it runs')")
+            await page.until("document.getElementById('banner').textContent.includes('start `lumiloop run`')")
             await page.until("document.getElementById('state-name').textContent === 'NO DAEMON'")
             assert page.said == []
         async with tab(browser, address, PHONE, phone=True) as page:  # the name of a socket is long, and has no gaps
             await page.until("globalThis.lumiloop")
-            await page.until("document.getElementById('banner').textContent.includes('check that it runs')")
+            await page.until("document.getElementById('banner').textContent.includes('start `lumiloop run`')")
             beside = await page.js(
                 "[document.getElementById('banner'), document.querySelector('.tools')].map((one) => ["
                 "one.scrollWidth - one.clientWidth, one.getBoundingClientRect().left,"
