@@ -157,7 +157,7 @@ def test_reasons_and_faults_come_with_a_remedy(capsys: pytest.CaptureFixture[str
     assert run_against(snapshot(reason=4, fault=101), advance=False) == 0
     shown = capsys.readouterr().out
     silent = "no valid scan for three scan periods, or scans are not steady yet"
-    assert f"reason     4: {silent} (check the lidar's power and cable)\n" in shown
+    assert f"reason     4: {silent} (read the fault; check the lidar's power and cable)\n" in shown
     assert "fault      101: no lidar is found (" in shown
 
 

@@ -175,6 +175,23 @@ def test_import_into_the_configured_folder(file: Path, tmp_path: Path) -> None:
     assert start.stored.meta.name == "map"
 
 
+def test_while_a_daemon_runs_an_imported_map_goes_there_by_a_copy(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("export", file, "--out", tmp_path / "out")
+    yaml_file, folder, new = tmp_path / "out" / "map.yaml", tmp_path / "kept", tmp_path / "new.lumimap"
+    daemon = Store(folder)
+    daemon.claim()
+    assert run("import", yaml_file, "--set", f"map.folder={folder}") == console.FAILED
+    assert "use --out FILE, copy the file there and run `lumiloop switch-map FILE`" in capsys.readouterr().err
+    assert run("import", yaml_file, "--out", new) == console.OK
+    (folder / new.name).write_bytes(new.read_bytes())
+    start = daemon.load()
+    assert start is not None
+    assert start.stored.meta.map_id == opened(new).meta.map_id
+    daemon.close()
+
+
 def test_align_moves_everything_and_begins_a_frame_of_its_own(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     T = np.array((10.0, -3.0, 0.5))
     points = [(-4.0, -4.0), (4.0, -4.0), (4.0, 4.0)]
