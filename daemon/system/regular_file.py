@@ -95,9 +95,7 @@ def _must_be_regular(path: Path, mode: int) -> None:
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(mode):
-        raise OSError(
-            errno.EINVAL, f"it is {_KINDS.get(stat.S_IFMT(mode), 'a device')}, not a regular file", str(path)
-        )
+        raise OSError(errno.EINVAL, f"it is {_KINDS.get(stat.S_IFMT(mode), 'a device')}, not a regular file", str(path))
 
 
 def _bounded(path: Path, content: bytes, size: int, most_bytes: int) -> bytes:
