@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.cdma.epoch import BlockFlag
+from estimator.cdma.epoch import BlockFlag, PwmLight
 from estimator.measurements import Job
 from estimator.numerics.arrays import Array
 
@@ -219,6 +219,7 @@ class LightsResult:
         t_pose: instant of the newest record of any kind.
         bent: gain consistency: excess of the normalised squared deviation of gains and tilts, per lamp, over its usual
             and its long-term value (`model_consistency.Bent`).
+        pwm: PWM-dimmed lamps in view. slow: codes of lamps that rise too slowly.
     """
 
     t_mono: float
@@ -234,6 +235,8 @@ class LightsResult:
     clock_ppm: float | None = None
     t_pose: float = -math.inf
     bent: float = 0.0
+    pwm: tuple[PwmLight, ...] = ()
+    slow: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -110,7 +110,7 @@ class Search:
         """No job in progress and no spectra computed."""
         self._profile = profile
         self._codes = gold_codes(profile.degree)
-        self._table = pulse_table(profile)
+        self._table = pulse_table(profile)[None]
         self._energy = pulse_energy(profile)
         self._cache: Spectrum = np.empty((0, 0), np.complex64)
         self._cache_clock: Array = np.empty(0)
@@ -296,7 +296,7 @@ class Search:
             phase=phase - np.floor((phase + job.block.x[0]) / self._profile.length) * self._profile.length,
             rate=np.ones(few), phase_var=np.ones(few), lag_var=1.0, clock_var=1.0,
             amplitude=np.array([f.amplitude for f in found]),
-            bit_sum=np.zeros(few), bit_weight=np.zeros(few),
+            bit_sum=np.zeros(few), bit_weight=np.zeros(few), pulse=np.zeros(few),
         )  # fmt: skip
         block = replace(job.block, y=without(job.block, prior, self._table))
         codes = np.append(job.codes, [f.code for f in found])

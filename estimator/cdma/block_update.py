@@ -12,13 +12,18 @@ import numpy.typing as npt
 from estimator.cdma.acquisition import DOMINANCE, Job, Outcome, Search
 from estimator.cdma.acquisition_budget import Watch
 from estimator.cdma.air_interface import Profile
+from estimator.cdma.anomalies.saturation import unsteadiness
+from estimator.cdma.anomalies.slow_lamps import SlowLamps
+from estimator.cdma.anomalies.time_base import TimeBase
+from estimator.cdma.anomalies.twin import LEADERS as LEADING
+from estimator.cdma.anomalies.twin import find_twin
 from estimator.cdma.bus_stall import judge, mend
 from estimator.cdma.chip_pulse import Shape, pulse_energy
-from estimator.cdma.code_tracking import CLEAR, Clocks, Life, Tracks
+from estimator.cdma.code_tracking import CAPACITY, CLEAR, Clocks, Life, Tracks
 from estimator.cdma.data_bits import side_lobe
-from estimator.cdma.epoch import BlockFlag, SampleBlock
+from estimator.cdma.epoch import USUAL, BlockFlag, SampleBlock
+from estimator.cdma.interference.background import Background
 from estimator.cdma.joint_fit import joint_fit
-from estimator.cdma.mains_rejection import Mains
 from estimator.cdma.sample_block import Fit, Prior, Sampled
 
 Index = npt.NDArray[np.int64]
@@ -32,8 +37,11 @@ LAG_VAR: Final = 0.05**2
 STAMP_MARGIN_S: Final = 120e-6
 """Margin of the delay search beyond the uncertainty of the block's two time stamps, s."""
 
+TOO_LONG_S: Final = 2.0 * STAMP_MARGIN_S
+"""Excess of the time between a block's stamps over that of its samples from which it contains pauses, s."""
+
 PATIENCE: Final = 2
-"""Noisy blocks in a row that are not learned from; a longer disturbance is permanent."""
+"""Noisy or stalled blocks in a row that are not learned from; a longer disturbance is permanent."""
 
 CROSSED: Final = 0.1
 """Cross-correlation of partial code periods, rms."""
@@ -45,14 +53,33 @@ SPURIOUS: Final = 0.01
 """Share of the strongest lamp's amplitude below which errors of the pulse shape can look like lamps."""
 
 
+RESTED: Final = 3
+"""Blocks after a twin was found until the next test: the twin is judged, and all lamps are tracked meanwhile."""
+
+UNTESTED: Final = 32
+"""Blocks without any sign of a twin until one of the strongest lamps, in turn, is tested for one."""
+
+
+ASTRAY: Final = 0.3
+"""Share of its twin's amplitude below which a lamp has been followed at a wrong phase, and is dropped."""
+
+UNKNOWN_PAUSES: Final = 0.5
+"""Relative sigma of all amplitudes in blocks that take too long, while it is not known where the bus pauses."""
+
+
+_TENTATIVE, _UNUSUAL, _STALLED = int(Life.TENTATIVE), ~int(USUAL), int(BlockFlag.STALLED)
+_MENDED, _NOISY, _CLIPPED = int(BlockFlag.MENDED), int(BlockFlag.NOISY), int(BlockFlag.CLIPPED)
+"""Flags as plain numbers: enum operations are slow."""
+
+
 class Decoder:
     """State of the decoder of one photodiode; created by :func:`estimator.cdma.decoder.new_decoder`."""
 
     def __init__(self, profile: Profile, clock_ppm: float | None, hung: Collection[int] = ()) -> None:
         """``clock_ppm``: stored error of the sample clock, or None; ``hung``: codes of lamps in the building."""
         self.profile = profile
-        self.shape = Shape(profile)
-        self.mains = Mains(profile.sample_rate, profile.mains_harmonics)
+        self.shape = Shape(profile, CAPACITY)
+        self.background = Background(profile)
         self.clocks = Clocks(profile, clock_ppm)
         self.tracks = Tracks(profile)
         self.search = Search(profile, hung)
@@ -62,6 +89,10 @@ class Decoder:
         self.found: Outcome | None = None
         self.barren = 0
         self.past = 0
+        self.stalled = 0
+        self.time_base = TimeBase()
+        self.slow_lamps = SlowLamps(profile, CAPACITY)
+        self.untested, self.rank = RESTED, 0
         self.odd = 0
         self.noise = 0.0
         self.usual_noise = 0.0
@@ -88,24 +119,75 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     The tracks must already be predicted to the middle of the block.
     """
     tracks, clocks = decoder.tracks, decoder.clocks
+    tracks.merge_twins()
+    excess = max(block.t_end - block.t_begin - len(sampled.x) / block.rate * (1.0 + clocks.clock), 0.0)
+    decoder.time_base.on_stamps(clocks.known and excess > TOO_LONG_S)
     if not len(tracks.slots):
         clocks.rest()
+        decoder.background.learn(sampled.y, sampled.clean)
         return BlockFlag.NONE, replace(sampled, y=sampled.clean)
-    excess = max(block.t_end - block.t_begin - len(sampled.x) / block.rate * (1.0 + clocks.clock), 0.0)
     flags, solved = _solve(decoder, sampled, _find_lag(decoder, sampled, excess))
-    noisy = bool(flags & BlockFlag.NOISY)
+    found = int(flags)
+    noisy, stalled = bool(found & _NOISY), bool(found & _STALLED)
+    decoder.stalled = decoder.stalled + 1 if stalled else 0
+    unsteady = unsteadiness(solved.block.y, solved.fit)
+    if unsteady:
+        flags, found = flags | BlockFlag.OVERDRIVEN, found | int(BlockFlag.OVERDRIVEN)
+    if decoder.time_base.unknown:
+        unsteady = max(unsteady, UNKNOWN_PAUSES)
+    if _add_twin(decoder, solved, found, unsteady):
+        return flags, replace(solved.block, y=np.zeros_like(solved.fit.residual))
     if noisy and decoder.odd < PATIENCE:
-        _weigh(decoder, solved.fit)
-    elif not flags & BlockFlag.STALLED:
-        _weigh(decoder, solved.fit)
+        _weigh(decoder, solved.fit, unsteady)
+    elif not stalled or decoder.stalled > PATIENCE:
+        _weigh(decoder, solved.fit, unsteady)
         _read(decoder, solved)
         if solved.fit.clearest > CLEAR:  # otherwise no lamp is received, and the delay found is chance
             clocks.update(solved.lag + solved.fit.lag - float(clocks.state[0]), excess, solved.fit)
             tracks.learn_phases(tracks.slots, solved.fit)
         _live_and_die(decoder, solved, suspicious=noisy)
-    if flags in (BlockFlag.NONE, BlockFlag.CLIPPED) and len(tracks.confirmed):
-        decoder.shape.learn(solved.block, solved.prior, solved.fit)
+    if not found & (_STALLED | _MENDED):
+        decoder.background.learn(solved.fit.residual + solved.fit.nuisance, solved.fit.residual)
+    lasting = not noisy or decoder.odd >= PATIENCE
+    if lasting and not found & ~(_CLIPPED | _NOISY) and len(tracks.confirmed):
+        codes = tracks.code[tracks.slots]
+        if len(codes) == len(solved.fit.amplitude):  # none has been dropped
+            decoder.slow_lamps.learn(solved.block, solved.prior, solved.fit, decoder.shape, tracks.slots, codes)
     return flags, replace(solved.block, y=solved.fit.residual)
+
+
+def _add_twin(decoder: Decoder, solved: _Solved, flags: int, unsteady: float) -> bool:
+    """Look for a twin of a lamp where there may be one, and add it; returns whether there was one.
+
+    Candidates are dropped then: they may be cross-correlations of it.
+    """
+    tracks, slots = decoder.tracks, decoder.tracks.slots
+    trying = tracks.life[slots] == _TENTATIVE
+    decoder.untested += 1
+    if decoder.untested <= RESTED or flags & _MENDED:
+        return False
+    only = None
+    if not (flags & _UNUSUAL or trying.any()):
+        if decoder.untested < RESTED + UNTESTED:
+            return False
+        decoder.rank = only = (decoder.rank + 1) % LEADING
+    twin = find_twin(solved.block, solved.prior, solved.fit, decoder.shape, decoder.profile, only)
+    if twin is None:
+        decoder.untested = RESTED
+        return False
+    decoder.untested = 0
+    first = int(slots[twin.lamp])
+    _weigh(decoder, solved.fit, unsteady)
+    for slot in slots[trying & (slots != first) & (tracks.code[slots] != tracks.code[first])].tolist():
+        tracks.drop(slot)
+    shift = float(solved.fit.phase[twin.lamp]) + solved.lag + solved.fit.lag - float(decoder.clocks.state[0])
+    tracks.add_twin(first, twin.second + shift, twin.amplitude)
+    if twin.first_amplitude < ASTRAY * twin.amplitude:  # the lamp has been followed at a wrong phase
+        tracks.drop(first)
+    else:
+        tracks.shift(first, twin.first + shift)
+    decoder.offered = None
+    return True
 
 
 def _find_lag(decoder: Decoder, sampled: Sampled, excess: float) -> float:
@@ -122,26 +204,36 @@ def _find_lag(decoder: Decoder, sampled: Sampled, excess: float) -> float:
 
 def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _Solved]:
     """Joint fit of the block; if it does not explain the block, an attempt to correct a bus stall."""
-    tracks, clocks, table = decoder.tracks, decoder.clocks, decoder.shape.table
+    tracks, clocks, tables = decoder.tracks, decoder.clocks, decoder.shape.tables
     slots, span = tracks.slots, -float(sampled.x[0])
+    pulse = decoder.slow_lamps.pulse(slots, tracks.code[slots], decoder.shape)
 
     def prior_at(more: float) -> Prior:
         """Prediction of the tracks at a common delay ``lag + more``, chips."""
-        return tracks.prior(slots, lag + more, LAG_VAR, clocks.clock_var, span)
+        return tracks.prior(slots, lag + more, (LAG_VAR, clocks.clock_var), span, pulse)
 
     prior = prior_at(0.0)
-    fit = joint_fit(sampled, prior, table)
+    fit = joint_fit(sampled, prior, tables)
+    if decoder.background.refine(fit.residual + fit.nuisance):
+        rows = decoder.background.masked(np.arange(len(sampled.y), dtype=np.float64), sampled.mask)
+        sampled = Sampled(sampled.y, sampled.x, sampled.mask, rows)
+        fit = joint_fit(sampled, prior, tables)
     solved = _Solved(sampled, prior, lag, fit)
     verdict = judge(sampled, fit, decoder.usual_noise)
     _listen(decoder, fit)
+    if len(tracks.confirmed):
+        decoder.time_base.learn(fit.mixed_slope, fit.residual, fit.noise_var)
     if verdict.good or not len(tracks.confirmed):
         return BlockFlag.NONE, solved
     newcomers = bool(np.any(tracks.life[slots] == Life.TENTATIVE))
     if newcomers and not (verdict.bent or verdict.smooth):
         return BlockFlag.NOISY, solved  # the residual comes from the candidates
-    mended = mend(sampled, fit, prior_at, table, decoder.mains, decoder.usual_noise)
+    mended = mend(sampled, fit, prior_at, tables, decoder.background, decoder.usual_noise)
     if isinstance(mended, bool):
         return BlockFlag.STALLED if mended else BlockFlag.NOISY, solved
+    if len(tracks.confirmed) >= LEADERS or not newcomers:
+        pause = mended.block.x - sampled.x
+        decoder.time_base.on_pause(mended.block.steps[0], float(pause[-1] + mended.fit.steps[0]))
     return BlockFlag.MENDED, _Solved(mended.block, mended.prior, lag + mended.lag, mended.fit)
 
 
@@ -155,12 +247,16 @@ def _listen(decoder: Decoder, fit: Fit) -> None:
         decoder.usual_noise = usual + (0.1 if change > 0.0 else 0.5) * change
 
 
-def _weigh(decoder: Decoder, fit: Fit) -> None:
-    """Store the amplitudes. Excess residual adds to their variance: it may be a lamp, and codes are not orthogonal."""
+def _weigh(decoder: Decoder, fit: Fit, unsteady: float) -> None:
+    """Store the amplitudes. Excess residual adds to their variance: it may be a lamp, and codes are not orthogonal.
+
+    ``unsteady``: relative change of all amplitudes within the block, rms; it adds likewise.
+    """
     tracks, slots = decoder.tracks, decoder.tracks.slots
     excess = max(fit.noise_var - (QUIET * decoder.usual_noise) ** 2, 0.0) if decoder.usual_noise else 0.0
     crossed = CROSSED**2 * excess / pulse_energy(decoder.profile)
-    tracks.weigh(slots, fit.amplitude, fit.amplitude_var + crossed)
+    variance = fit.amplitude_var + crossed + (unsteady * fit.amplitude) ** 2
+    tracks.weigh(slots, fit.amplitude, variance + decoder.slow_lamps.spread(slots, fit.amplitude, decoder.shape))
     decoder.noise = float(np.sqrt(fit.noise_var))
 
 
@@ -182,7 +278,7 @@ def _live_and_die(decoder: Decoder, solved: _Solved, suspicious: bool) -> None:
     tracks, slots = decoder.tracks, decoder.tracks.slots
     doubtful = suspicious & (solved.fit.amplitude > CLEAR * np.sqrt(solved.fit.amplitude_var))  # only if received
     for k in np.flatnonzero((tracks.life[slots] == Life.TENTATIVE) | doubtful):
-        beside = side_lobe(solved.block, solved.prior, solved.fit, int(k), decoder.shape.table)
+        beside = side_lobe(solved.block, solved.prior, solved.fit, int(k), decoder.shape.tables)
         if beside:
             tracks.move(int(slots[k]), beside)
     hidden = DOMINANCE * float(np.sqrt(solved.fit.noise_var / pulse_energy(decoder.profile)))

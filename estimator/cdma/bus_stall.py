@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma.correlation_kernels import columns
+from estimator.cdma.interference.background import Background
 from estimator.cdma.joint_fit import joint_fit
-from estimator.cdma.mains_rejection import Mains
 from estimator.cdma.sample_block import Fit, Prior, Sampled
 from estimator.numerics.arrays import Array
 
@@ -113,7 +113,12 @@ def _two_chips(row: Array) -> Array:
 
 
 def mend(
-    block: Sampled, fit: Fit, prior_at: Callable[[float], Prior], table: Array, mains: Mains, usual_noise: float
+    block: Sampled,
+    fit: Fit,
+    prior_at: Callable[[float], Prior],
+    tables: Array,
+    background: Background,
+    usual_noise: float,
 ) -> Mended | bool:
     """Try to explain a block by one pause. If that fails, return whether there is evidence of a pause.
 
@@ -121,14 +126,14 @@ def mend(
         block: as it was solved.
         fit: the fit to it.
         prior_at: prediction of the tracks for a common delay beyond the one `fit` started from, chips.
-        table: pulse table.
-        mains: for the mains rows of a corrected time base.
+        tables: pulse tables.
+        background: for the rows of a corrected time base.
         usual_noise: ADC steps, to judge the result by.
     """
     verdict = judge(block, fit, usual_noise)
     evident = verdict.bent or verdict.smooth
     for place in (_large_pause, _small_pause):
-        found = place(block, fit, prior_at(fit.lag), table)
+        found = place(block, fit, prior_at(fit.lag), tables)
         if found is None or (place is _small_pause and not evident):
             continue
         low, high, at, chips, lag = found
@@ -138,9 +143,9 @@ def mend(
         for _ in range(PASSES):
             x = block.x.copy()
             x[at:] += chips
-            rows = mains.masked((x - x[0]) / (block.x[1] - block.x[0]), mask)
+            rows = background.masked((x - x[0]) / (block.x[1] - block.x[0]), mask)
             bent, prior = Sampled(block.y * mask, x, mask, rows, (at,)), prior_at(lag)
-            again = joint_fit(bent, prior, table)
+            again = joint_fit(bent, prior, tables)
             verdict = judge(bent, again, usual_noise)
             if verdict.good:
                 return Mended(bent, prior, again, lag)
@@ -153,13 +158,13 @@ _Pause = tuple[int, int, int, float, float]
 """Masked samples (first, end), first sample after the pause, its length (chips), delay of the front part (chips)."""
 
 
-def _large_pause(block: Sampled, fit: Fit, prior: Prior, table: Array) -> _Pause | None:
+def _large_pause(block: Sampled, fit: Fit, prior: Prior, tables: Array) -> _Pause | None:
     """Find a pause by two delays, before and after it, correlating the strongest lamps at whole-sample lags."""
     chosen = np.argsort(-fit.amplitude)[:LEADERS]
     n, spacing = len(block.x), float(block.x[1] - block.x[0])
     waves, ones = np.empty((2, len(chosen), n)), np.ones((len(chosen), fit.soft.shape[1]))
     lamps = np.ascontiguousarray(prior.lamps(fit.phase)[:, chosen])
-    columns(prior.chips[chosen], lamps, block.samples, ones, table, waves)
+    columns(prior.chips[chosen], lamps, block.samples, ones, tables, waves)
     y = (block.y - _two_chips(block.y)) * block.mask  # without the step of the mains flicker at the pause
     segment = max(int(SEGMENT_CHIPS / spacing), 4)
     edges = np.arange(0, n - segment // 2, segment)
@@ -182,9 +187,9 @@ def _large_pause(block: Sampled, fit: Fit, prior: Prior, table: Array) -> _Pause
     return max(at - segment, 0), min(at + segment, n), at, (after - before) * spacing, before * spacing
 
 
-def _small_pause(block: Sampled, fit: Fit, prior: Prior, table: Array) -> _Pause | None:
+def _small_pause(block: Sampled, fit: Fit, prior: Prior, tables: Array) -> _Pause | None:
     """Find the position at which a phase step explains most of the residual."""
-    del prior, table
+    del prior, tables
     n = len(block.y)
     overlap = np.cumsum(fit.mixed_slope * fit.residual)
     energy = np.cumsum(fit.mixed_slope**2)

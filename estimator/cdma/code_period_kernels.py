@@ -31,7 +31,7 @@ def lay_out(chips: F8, lamps: F8, samples: F8, tail: int, bounds: I8, index: I8)
 
     Args:
         chips: (L, C) chips of each lamp's code.
-        lamps: (2, L) phase in chips at time 0, counted from the begin of the first period, and rate.
+        lamps: (2 or more, L) phase in chips at time 0, counted from the begin of the first period, and rate.
         samples: times in row 0, non-decreasing; other rows are not used.
         tail: samples by which a period outlasts itself.
         bounds: (L, P + 1) out: index of the first sample of each period; N behind the last.
@@ -57,27 +57,33 @@ def lay_out(chips: F8, lamps: F8, samples: F8, tail: int, bounds: I8, index: I8)
     return count
 
 
-@kernel("void(f8[:,::1], f8[:,::1], f8[:,::1], i8[:,::1], i8, f8[:,::1], f8[::1], f8[:,::1])")
-def cut(chips: F8, lamps: F8, samples: F8, index: I8, count: int, table: F8, drive: F8, out: F8) -> None:
+@kernel("void(f8[:,::1], f8[:,::1], f8[:,::1], i8[:,::1], i8, f8[:,:,::1], f8[::1], f8[:,::1])")
+def cut(chips: F8, lamps: F8, samples: F8, index: I8, count: int, tables: F8, drive: F8, out: F8) -> None:
     """Rows of one lamp in one code period each, with the tail beyond its end, at amplitude and sign 1.
 
     Args:
         chips: (L, C), as for :func:`lay_out`.
-        lamps: (2, L), likewise.
+        lamps: (3, L), likewise; row 2: number of the lamp's pulse table.
         samples: (3, N) times; the weight of each sample, 1 or 0; the received signal.
         index: as written by :func:`lay_out`.
         count: number of pieces, K.
-        table: of :func:`estimator.cdma.chip_pulse.pulse_table`.
+        tables: (T, S, 4) of :func:`estimator.cdma.chip_pulse.pulse_table`.
         drive: (L,) amplitude of lamps whose sign is certain from correlation alone; 0 for the others.
         out: (K + 2 or more, N) the rows; then the derivative of all driven lamps together, and that times time.
     """
-    length, steps, size = chips.shape[1], table.shape[0] - 1, samples.shape[1]
+    length, steps, size = chips.shape[1], tables.shape[1] - 1, samples.shape[1]
     x, received = samples[0], samples[2]
     mixed, slope = out[count], np.empty(size)
     mixed[:] = 0.0
     for r in range(count):
         i, p, low, high = index[0, r], index[1, r], index[2, r], index[3, r]
-        code, row, rate, phase = chips[i], out[r], lamps[1, i], lamps[0, i]
+        code, row, rate, phase, table = (
+            chips[i],
+            out[r],
+            lamps[1, i],
+            lamps[0, i],
+            tables[int(lamps[2, i]) if lamps.shape[0] > 2 else 0],
+        )
         before = code[length - 1] if p == 0 else 0.0  # the sign of the period before the first is not resolved
         for _ in range(p):
             phase -= length

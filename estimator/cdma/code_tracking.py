@@ -46,6 +46,9 @@ STAMP_S: Final = 40e-6
 APART: Final = 1.0
 """Distance (chips) below which two lamps with the same code cannot be separated."""
 
+MERGED: Final = 0.12
+"""Distance (chips) below which two tracked lamps with the same code are taken for one."""
+
 ASTRAY: Final = 0.15
 """Sigma (chips) above which a phase is dropped, as after a long pause; a new acquisition takes 0.2 s."""
 
@@ -198,6 +201,36 @@ class Tracks:
         self._place(k, phase, t)
         self.amplitude[k], self.amplitude_var[k] = amplitude, 0.0
 
+    def add_twin(self, slot: int, shift: float, amplitude: float) -> None:
+        """Add a candidate of a tracked lamp's code, ``shift`` chips from it; ignored if all slots are occupied."""
+        free = np.flatnonzero(self.life == Life.FREE)
+        if not len(free):
+            return
+        k = int(free[0])
+        self.life[k], self.code[k] = Life.TENTATIVE, self.code[slot]
+        self.frames[k] = None
+        self._place(k, float(self.phase[slot]) + shift, self.t)
+        self.amplitude[k], self.amplitude_var[k] = amplitude, 0.0
+
+    def shift(self, slot: int, chips: float) -> None:
+        """Correct the phase of a lamp by ``chips``, with the uncertainty of an acquisition, and keep the rest."""
+        self.phase[slot] += chips
+        self.cov[slot] = [[NEW_PHASE**2, 0.0], [0.0, self.cov[slot, 1, 1]]]
+
+    def merge_twins(self) -> None:
+        """Drop the weaker of two lamps of one code that have come too close to be separated."""
+        slots = self.slots
+        codes = self.code[slots]
+        if len(set(codes.tolist())) == len(slots):
+            return
+        for k, slot in enumerate(slots.tolist()):
+            others = slots[:k][codes[:k] == codes[k]]
+            apart = np.abs(
+                (self.phase[others] - self.phase[slot] + 0.5 * self.length) % self.length - 0.5 * self.length
+            )
+            for other in others[(apart < MERGED) & (self.life[others] != _FREE)].tolist():
+                self.drop(slot if self.amplitude[slot] < self.amplitude[other] else other)
+
     def _place(self, k: int, phase: float, t: float) -> None:
         """Set a slot to the phase of a search at time ``t``."""
         chips = (self.t - t) * self._chip_rate
@@ -238,8 +271,8 @@ class Tracks:
         begin = self.phase[slots] + lag - (1.0 + self.rate[slots]) * span
         return np.floor((begin - 1.0) / self.length).astype(np.int64)
 
-    def prior(self, slots: Index, lag: float, lag_var: float, clock_var: float, span: float) -> Prior:
-        """Prediction for a block whose middle is at ``t``."""
+    def prior(self, slots: Index, lag: float, variances: tuple[float, float], span: float, pulse: Array) -> Prior:
+        """Prediction for a block whose middle is at ``t``; ``variances``: of delay and clock; ``pulse``: tables."""
         first = self.first_period(slots, lag, span)
         bit_sum, bit_weight = self.rings.before(slots, first)
         phase = self.phase[slots] + lag
@@ -248,11 +281,12 @@ class Tracks:
             phase=phase - first * self.length,
             rate=1.0 + self.rate[slots],
             phase_var=self.cov[slots, 0, 0],
-            lag_var=lag_var,
-            clock_var=clock_var,
+            lag_var=variances[0],
+            clock_var=variances[1],
             amplitude=self.amplitude[slots],
             bit_sum=bit_sum,
             bit_weight=bit_weight,
+            pulse=pulse,
         )
 
     def learn_phases(self, slots: Index, fit: Fit) -> None:

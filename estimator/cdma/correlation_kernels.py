@@ -34,29 +34,31 @@ def first_from(x: F8, begin: int, limit: float) -> int:
     return low
 
 
-@kernel("i8[:,::1](f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1])")
-def columns(chips: F8, lamps: F8, samples: F8, signs: F8, table: F8, out: F8) -> I8:
+@kernel("i8[:,::1](f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1])")
+def columns(chips: F8, lamps: F8, samples: F8, signs: F8, tables: F8, out: F8) -> I8:
     """Received waveform of each lamp at amplitude 1, and its derivative with respect to the code phase.
 
     The pulse table is expanded to first order around its nearest point (5e-5 of the pulse, 4e-4 at its corners).
 
     Args:
         chips: (L, C) chips of each lamp's code.
-        lamps: (2, L) phase and rate. The phase is in chips at time 0, counted from the begin of the first period. A
-            first sample slightly before that begin is taken as at it. The rate is in chips per unit of time.
+        lamps: (3, L) phase, rate, and number of the pulse table; (2, L) if all have the first one. The phase is in
+            chips at time 0, counted from the begin of the first period. A first sample slightly before that begin is
+            taken as at it. The rate is in chips per unit of time.
         samples: (2, N) times, non-decreasing, and weight: 1, or 0 for a sample that is not to be used.
         signs: (L, P) data sign of each code period touched, in order (0 leaves the period out).
-        table: of :func:`estimator.cdma.chip_pulse.pulse_table`.
+        tables: (T, S, 4) of :func:`estimator.cdma.chip_pulse.pulse_table`.
         out: (2, L, N) waveforms and derivatives.
 
     Returns:
         (L, P + 1) index of the first sample of each period; N behind the last.
     """
-    length, steps = chips.shape[1], table.shape[0] - 1
+    length, steps = chips.shape[1], tables.shape[1] - 1
     n_lamps, n_samples = out.shape[1], out.shape[2]
     bounds, sent = np.full((n_lamps, signs.shape[1] + 1), n_samples), np.empty(length + 1)
     for i in range(n_lamps):
         phase, rate = lamps[0, i], lamps[1, i]
+        table = tables[int(lamps[2, i]) if lamps.shape[0] > 2 else 0]
         before = signs[i, 0]
         begin, period = 0, 0
         while begin < n_samples and period < signs.shape[1]:
@@ -326,3 +328,15 @@ def fold(slots: I8, period: I8, soft: F8, variance: F8, fade: float, rings: F8, 
                 rings[0, row, at] = keep * rings[0, row, at] + soft[i, p] / variance[i, p]
                 rings[1, row, at] = keep * rings[1, row, at] + 1.0 / variance[i, p]
                 last[row, at] = index
+
+
+@kernel("void(f8, f8[::1], f8[:,::1])")
+def tones(frequency: float, times: F8, out: F8) -> None:
+    """Cosines, then sines, of a frequency (cycles per sample) and its multiples; ``out``: (2 * count, N)."""
+    count = out.shape[0] // 2
+    for n in range(times.shape[0]):
+        turn = 2.0 * math.pi * frequency * times[n]
+        c, s, re, im = math.cos(turn), math.sin(turn), 1.0, 0.0
+        for k in range(count):
+            re, im = re * c - im * s, re * s + im * c
+            out[k, n], out[count + k, n] = re, im

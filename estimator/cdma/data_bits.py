@@ -60,7 +60,7 @@ class Signs:
     noise_var: float
 
 
-def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
+def solve_pieces(block: Sampled, prior: Prior, tables: Array) -> Pieces:
     """Solve for the amplitude of each lamp in each code period touched, at the phases of the prior."""
     n_lamps, length = prior.chips.shape
     span = float(block.x[-1] - block.x[0])
@@ -71,7 +71,7 @@ def solve_pieces(block: Sampled, prior: Prior, table: Array) -> Pieces:
     k = lay_out(prior.chips, lamps, samples, tail, bounds, index)
     stack = stacked(block, k + 2)
     drive = np.where(prior.amplitude > LEADER * np.max(prior.amplitude), prior.amplitude, 0.0)
-    cut(prior.chips, lamps, samples, index, k, table, drive, stack)
+    cut(prior.chips, lamps, samples, index, k, tables, drive, stack)
     found, unit_var = np.empty(k + 2), np.empty(k)
     noise_var = solve_rows(stack, index, k, len(block.q), found, unit_var)
     return Pieces(index, bounds, stack[: k + 2], found, unit_var, noise_var)
@@ -85,15 +85,15 @@ def stacked(block: Sampled, free: int) -> Array:
     return stack
 
 
-def without(block: Sampled, prior: Prior, table: Array) -> Array:
+def without(block: Sampled, prior: Prior, tables: Array) -> Array:
     """(N,) residual of a block after subtracting these lamps near these phases, and the mains."""
-    pieces = solve_pieces(block, prior, table)
+    pieces = solve_pieces(block, prior, tables)
     return block.project(block.y - mixed(pieces.found, pieces.rows))
 
 
-def data_signs(block: Sampled, prior: Prior, table: Array) -> Signs:
+def data_signs(block: Sampled, prior: Prior, tables: Array) -> Signs:
     """Data signs of a block, from this block and from the last block's soft bits of the first period touched."""
-    pieces = solve_pieces(block, prior, table)
+    pieces = solve_pieces(block, prior, tables)
     whole = prior.chips.shape[1] * len(block.x) / float(block.x[-1] - block.x[0])
     found = rows_of(pieces.found[:-2], pieces.noise_var * pieces.unit_var)
     told = np.empty((3, len(prior.phase), pieces.bounds.shape[1] - 1))
@@ -108,13 +108,13 @@ SHIFTS: Final = np.array([0.0, -0.5, 0.5, -1.0, 1.0])
 """Side lobes of a Manchester code, chips (-0.5 at half a chip)."""
 
 
-def side_lobe(block: Sampled, prior: Prior, fit: Fit, lamp: int, table: Array) -> float:
+def side_lobe(block: Sampled, prior: Prior, fit: Fit, lamp: int, tables: Array) -> float:
     """Distance (chips) of one lamp of a fit from its correlation peak: 0, or that of a side lobe."""
     few = len(SHIFTS)
     waves, signs, score = np.empty((2, few, len(block.x))), np.ones((few, fit.soft.shape[1])), np.empty(few)
     phase = prior.phase[lamp] + SHIFTS + fit.phase[lamp] + fit.lag
-    lamps = rows_of(phase, np.full(few, prior.rate[lamp] * (1.0 + fit.clock)))
-    bounds = columns(prior.chips[[lamp] * few], lamps, block.samples, signs, table, waves)
+    lamps = rows_of(phase, *np.full((few, 2), (prior.rate[lamp] * (1.0 + fit.clock), prior.pulse[lamp])).T)
+    bounds = columns(prior.chips[[lamp] * few], lamps, block.samples, signs, tables, waves)
     bits = np.where(fit.soft[lamp] < 0, -1.0, 1.0) * fit.amplitude[lamp]
     compare_shifts(waves[0], bounds[0], bits, fit.residual, score)
     return float(SHIFTS[score.argmax()])

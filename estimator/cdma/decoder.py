@@ -18,8 +18,9 @@ import numpy as np
 
 from estimator.cdma.acquisition import BIN, Found, Job
 from estimator.cdma.air_interface import Profile
+from estimator.cdma.anomalies.saturation import saturated
 from estimator.cdma.block_update import SPURIOUS, Decoder, follow
-from estimator.cdma.epoch import UNUSABLE, BlockFlag, LightEpoch, LinkFlag, SampleBlock
+from estimator.cdma.epoch import UNUSABLE, USUAL, BlockFlag, LightEpoch, LinkFlag, PwmLight, SampleBlock
 from estimator.cdma.sample_block import Sampled
 from estimator.numerics.arrays import Array
 
@@ -28,6 +29,8 @@ LONGEST: Final = 10
 
 CLIP_SHARE: Final = 0.2
 """Share of clipped samples above which a block is unusable."""
+STILL_SHARE: Final = 0.6
+"""Share of masked samples, those of a saturated first stage included, above which a block is unusable."""
 RAIL: Final = 1.0 / 128.0
 """Share of the range beside either rail that counts as the rail: amplifiers stop up to 25 mV short of 3.3 V."""
 
@@ -47,6 +50,14 @@ one candidate.
 
 AGAIN: Final = 2
 """Repeated searches of a block after subtracting the lamps found in it."""
+
+NAMED_A: Final = 0.3e-6
+"""Swing of a PWM lamp (A) from which it is named: weaker lines may be harmonics of the mains."""
+
+_DISTURBED, _ODD = ~int(BlockFlag.UNEVEN | BlockFlag.OVERDRIVEN), int(BlockFlag.STALLED | BlockFlag.NOISY)
+_UNUSUAL, _UNUSABLE = ~int(USUAL), int(UNUSABLE)
+_FAINT, _TWIN, _SLOW = int(LinkFlag.FAINT), int(LinkFlag.TWIN), int(LinkFlag.SLOW)
+"""Flags as plain numbers: enum operations are slow."""
 
 FULL_ROUND: Final = 8
 """Sweeps without a confirmed lamp until all sample clocks are tried."""
@@ -82,12 +93,13 @@ def decode(decoder: Decoder, block: SampleBlock) -> LightEpoch:
         decoder.clocks.predict(decoder.tracks.predict(t_middle))
         more, residual = follow(decoder, block, sampled)
         flags |= more
-        if flags == BlockFlag.NONE:
-            decoder.mains.learn(sampled.y)
-        decoder.odd = decoder.odd + 1 if flags & (BlockFlag.STALLED | BlockFlag.NOISY) else 0
+        found = int(flags)
+        if not found & _DISTURBED:
+            decoder.background.learn_mains(sampled.y, sampled.mask)
+        decoder.odd = decoder.odd + 1 if found & _ODD else 0
         if decoder.odd != 1:  # the residual of one block may be a stall; if the next repeats it, it is a lamp
             _offer(decoder, residual, t_middle)
-        _watch(decoder, flags)
+        _watch(decoder, found)
     return _epoch(decoder, block, flags)
 
 
@@ -110,7 +122,9 @@ def search(decoder: Decoder, codes: int) -> None:
     Other work counts as an equivalent number of codes, or has a call of its own. While nothing indicates further lamps,
     a small part of the effort is used: estimator/cdma/acquisition_budget.py.
     """
-    decoder.shape.renew()
+    later = decoder.shape.renew()
+    if later is not None:
+        decoder.tracks.phase += later * decoder.profile.chip_rate  # where the old pulse was found
     allowed = decoder.watch.allow(codes)
     decoder.watch.spend(allowed - _search(decoder, allowed))
 
@@ -210,20 +224,26 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
         flags = BlockFlag.CLIPPED
     if n - mask.sum() > CLIP_SHARE * n:
         return None, BlockFlag.SATURATED
+    still = saturated(words, mask)
+    if still is not None:
+        mask[still] = 0.0
+        flags |= BlockFlag.OVERDRIVEN
+        if n - mask.sum() > STILL_SHARE * n:
+            return None, flags | BlockFlag.SATURATED
     y = (words - 0.5 * (top + 1.0)) * mask
-    rows = decoder.mains.rows(y)
-    if flags:
-        rows = decoder.mains.masked(np.arange(n, dtype=float), mask)
+    rows = decoder.background.rows(y, mask, still is not None)
     chips = profile.chip_rate / block.rate * (1.0 + decoder.clocks.clock)
     at: Array = np.arange(n, dtype=np.float64) - 0.5 * (n - 1)
-    return Sampled(y, at * chips, mask, rows), flags
+    if decoder.time_base.uneven:
+        flags |= BlockFlag.UNEVEN
+    return Sampled(y, decoder.time_base.moved(at * chips), mask, rows), flags
 
 
-def _watch(decoder: Decoder, flags: BlockFlag) -> None:
+def _watch(decoder: Decoder, flags: int) -> None:
     """Update the acquisition budget with this block."""
     tracks = decoder.tracks
     lit = tracks.confirmed
-    odd = flags not in (BlockFlag.NONE, BlockFlag.CLIPPED) or len(lit) < len(tracks.slots)
+    odd = bool(flags & _UNUSUAL) or len(lit) < len(tracks.slots)
     ratio = decoder.noise / decoder.usual_noise if decoder.usual_noise else 0.0
     decoder.watch.on_block(int(np.count_nonzero(~tracks.faint(lit))), ratio, odd)
 
@@ -240,21 +260,37 @@ def _offer(decoder: Decoder, residual: Sampled, t_middle: float) -> None:
 def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch:
     """Links of the confirmed lamps; none if the block is unusable."""
     tracks, lsb = decoder.tracks, decoder.profile.front_end.lsb_a
-    links = tracks.confirmed if not flags & UNUSABLE else np.empty(0, np.int64)
+    links = tracks.confirmed if not int(flags) & _UNUSABLE else np.empty(0, np.int64)
     code, amplitude, variance = tracks.code[links], tracks.amplitude[links], tracks.amplitude_var[links]
     twin = (code[:, None] == code).sum(axis=1) > 1
-    faint = tracks.faint(links)
+    faint, slow = tracks.faint(links), decoder.slow_lamps.slow(links)
     return LightEpoch(
         t_begin=block.t_begin,
         t_end=block.t_end,
         ids=code,
         amplitude=amplitude * lsb,
-        variance=variance * lsb**2,
-        flags=faint * int(LinkFlag.FAINT) + twin * int(LinkFlag.TWIN),
+        variance=(variance + (decoder.time_base.doubt * amplitude) ** 2) * lsb**2,
+        flags=faint * _FAINT + twin * _TWIN + slow * _SLOW,
         lamps=tuple([tracks.frames[k] for k in links.tolist()]),
         block=flags,
         noise_a=decoder.noise * lsb,
         clock_ppm=decoder.clock_ppm,
+        pwm=_pwm(decoder),
+    )
+
+
+def _pwm(decoder: Decoder) -> tuple[PwmLight, ...]:
+    """PWM lamps in view, by the corrected sample clock."""
+    if not len(decoder.background.pwm):
+        return ()
+    named = decoder.background.pwm.named
+    scale, lsb = decoder.profile.sample_rate / (1.0 + decoder.clocks.clock), decoder.profile.front_end.lsb_a
+    return tuple(
+        [
+            PwmLight(lamp.frequency * scale, lamp.swing * lsb, None if lamp.other is None else lamp.other * scale)
+            for lamp in named
+            if lamp.swing * lsb >= NAMED_A
+        ]
     )
 
 

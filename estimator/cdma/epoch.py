@@ -26,9 +26,14 @@ class BlockFlag(IntFlag):
     STALLED = 32  # a bus stall inside; amplitudes are not to be used
     MENDED = 64  # a bus stall inside, corrected
     NOISY = 128  # residual far above usual: part of the light is not explained
+    OVERDRIVEN = 256  # the first stage was saturated for a part; these samples were masked
+    UNEVEN = 512  # the bus pauses at the same samples of every block; corrected as far as known
 
 
 UNUSABLE = BlockFlag.SATURATED | BlockFlag.FLAT | BlockFlag.MALFORMED | BlockFlag.LENGTH | BlockFlag.STALLED
+
+USUAL = BlockFlag.CLIPPED | BlockFlag.OVERDRIVEN | BlockFlag.UNEVEN
+"""Lasting conditions under which the joint fit explains a block."""
 
 
 class LinkFlag(IntFlag):
@@ -37,6 +42,11 @@ class LinkFlag(IntFlag):
     NONE = 0
     FAINT = 1  # amplitude not significant (occluded, or out of view); the phase is kept
     TWIN = 2  # another lamp with the same code is in view: the ID alone is ambiguous
+    SLOW = 4  # its light rises more slowly than the air interface allows: the amplitude is corrected
+
+
+SLOW = int(LinkFlag.SLOW)
+"""The flag as a number: enum operations on arrays are slow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +64,20 @@ class SampleBlock:
     rate: float
 
 
+@dataclass(frozen=True, slots=True)
+class PwmLight:
+    """A PWM-dimmed lamp in view.
+
+    Attributes:
+        hertz: frequency. swing_a: photocurrent between off and on, A.
+        other_hertz: a frequency that the samples cannot tell from it; None: the frequency is certain.
+    """
+
+    hertz: float
+    swing_a: float
+    other_hertz: float | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LightEpoch:
     """Lamps received over ``[t_begin, t_end]`` and their RSS; arrays have one element per link.
@@ -63,7 +87,7 @@ class LightEpoch:
         amplitude: RSS, A, amplitude of the modulated photocurrent. variance: A^2. flags: of :class:`LinkFlag`.
         lamps: data frame of each lamp, None until its first frame is complete.
         block: of :class:`BlockFlag`; without a usable block there are no links. noise_a: A per sample.
-        clock_ppm: error of the sample clock, None until it is known.
+        clock_ppm: error of the sample clock, None until it is known. pwm: PWM-dimmed lamps, whose light is taken out.
     """
 
     t_begin: float
@@ -76,3 +100,9 @@ class LightEpoch:
     block: BlockFlag
     noise_a: float
     clock_ppm: float | None
+    pwm: tuple[PwmLight, ...] = ()
+
+    @property
+    def slow(self) -> frozenset[int]:
+        """Codes of the lamps that rise too slowly."""
+        return frozenset(self.ids[(self.flags & SLOW) != 0].tolist())

@@ -24,6 +24,7 @@ from estimator.cdma.joint_fit_kernels import (
     MOVED_VAR,
     PHASE,
     PRECISION,
+    PULSE,
     RATE,
     SETTLED,
     VALUE,
@@ -38,13 +39,13 @@ MAX_STEPS: Final = 6
 """Most Gauss-Newton steps."""
 
 
-def joint_fit(block: Sampled, prior: Prior, table: Array) -> Fit:
+def joint_fit(block: Sampled, prior: Prior, tables: Array) -> Fit:
     """Fit all lamps of ``prior`` (at least one) to one block: Gauss-Newton until the steps are small.
 
     ``stack`` holds the columns of the system as rows: values (L), slopes (L), clock, stalls. One row follows for each
     code period of uncertain sign, with an amplitude of its own; then the mains rows and the block.
     """
-    first = data_signs(block, prior, table)
+    first = data_signs(block, prior, tables)
     lamps, common = _start(block, prior, first)
     n, pauses = len(prior.phase), len(block.steps)
     loose = np.array(np.nonzero(first.signs == 0.0), dtype=np.int64)
@@ -52,9 +53,9 @@ def joint_fit(block: Sampled, prior: Prior, table: Array) -> Fit:
     stack = stacked(block, free)
     noise = np.array((first.noise_var, max(int(block.mask.sum()) - len(block.q) - free, 1)))
     loose_precision = 1.0 / (4.0 * lamps[AMPLITUDE, loose[0]] ** 2 + 1e-12)
-    theta, variance, left = np.empty(free + 1), np.empty(free + 1), np.empty((2, len(block.x)))
+    theta, variance, left = np.empty(free + 1), np.empty(free + 1), np.empty((3, len(block.x)))
     for _ in range(MAX_STEPS):
-        build(stack, block.samples, lamps, common, prior.chips, first.signs, loose, table)
+        build(stack, block.samples, lamps, common, prior.chips, first.signs, loose, tables)
         scale = lamps[AMPLITUDE].copy()
         if solve_once(stack, lamps, common, loose_precision, noise, theta, variance) < SETTLED:
             break
@@ -75,6 +76,7 @@ def joint_fit(block: Sampled, prior: Prior, table: Array) -> Fit:
         soft_var=first.soft_var,
         signs=first.signs,
         mixed_slope=left[1],
+        nuisance=left[2],
     )
 
 
@@ -83,6 +85,7 @@ def _start(block: Sampled, prior: Prior, first: Signs) -> tuple[Array, Array]:
     weight = 1.0 / first.soft_var
     lamps = np.zeros((LAMP_ROWS, len(prior.phase)))
     lamps[PHASE], lamps[RATE], lamps[PRECISION] = prior.phase, prior.rate, 1.0 / prior.phase_var
+    lamps[PULSE] = prior.pulse
     lamps[AMPLITUDE] = (np.abs(first.soft) * weight).sum(axis=1) / weight.sum(axis=1)
     common = np.zeros((COMMON_ROWS, 2 + len(block.steps)))
     common[VALUE, :2] = first.lag, first.clock

@@ -17,10 +17,10 @@ from estimator.numerics.jit import kernel
 F8 = npt.NDArray[np.float64]
 I8 = npt.NDArray[np.int64]
 
-LAMP_ROWS = 7
-PHASE, RATE, PRECISION, AMPLITUDE, MOVED, AMPLITUDE_VAR, MOVED_VAR = range(LAMP_ROWS)
+LAMP_ROWS = 8
+PHASE, RATE, PRECISION, AMPLITUDE, MOVED, AMPLITUDE_VAR, MOVED_VAR, PULSE = range(LAMP_ROWS)
 """Rows of ``lamps``: phase, rate and inverse phase variance of the prior; amplitude; phase correction; variances of the
-last two.
+last two; number of the pulse table.
 """
 COMMON_ROWS = 4
 VALUE, COMMON_PRECISION, COMMON_VAR, AT = range(COMMON_ROWS)
@@ -70,8 +70,8 @@ def reduce_rows(stack: F8, extent: I8, free: int, matrix: F8, right: F8) -> floa
     return power
 
 
-@kernel("void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1])")
-def build(stack: F8, samples: F8, lamps: F8, common: F8, chips: F8, signs: F8, loose: I8, table: F8) -> None:
+@kernel("void(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], i8[:,::1], f8[:,:,::1])")
+def build(stack: F8, samples: F8, lamps: F8, common: F8, chips: F8, signs: F8, loose: I8, tables: F8) -> None:
     """Fill the rows of the unknowns at the present phases: values, slopes, clock, pauses, pieces of uncertain sign."""
     n, size, pauses, last = lamps.shape[1], samples.shape[1], common.shape[1] - 2, loose.shape[1]
     free = 2 * n + 1 + pauses + last
@@ -82,11 +82,11 @@ def build(stack: F8, samples: F8, lamps: F8, common: F8, chips: F8, signs: F8, l
     for s in range(pauses):
         for k in range(int(common[AT, 2 + s]), size):
             moved[0, k] += common[VALUE, 2 + s]
-    at = np.empty((2, n))
+    at = np.empty((3, n))
     for i in range(n):
         at[0, i] = lamps[PHASE, i] + (common[VALUE, 0] + lamps[MOVED, i])
-        at[1, i] = lamps[RATE, i]
-    columns(chips, at, moved, signs, table, stack[: 2 * n].reshape((2, n, size)))
+        at[1, i], at[2, i] = lamps[RATE, i], lamps[PULSE, i]
+    columns(chips, at, moved, signs, tables, stack[: 2 * n].reshape((2, n, size)))
     slope = mixed(lamps[AMPLITUDE], stack[n : 2 * n])
     for k in range(size):
         stack[2 * n, k] = slope[k] * samples[0, k]
@@ -94,13 +94,13 @@ def build(stack: F8, samples: F8, lamps: F8, common: F8, chips: F8, signs: F8, l
         row, begin = stack[2 * n + 1 + s], int(common[AT, 2 + s])
         row[:begin] = 0.0
         row[begin:] = slope[begin:]
-    wave, only, one = np.empty((2, 1, size)), np.empty((1, signs.shape[1])), np.empty((2, 1))
+    wave, only, one = np.empty((2, 1, size)), np.empty((1, signs.shape[1])), np.empty((3, 1))
     for r in range(last):
         i = loose[0, r]
         only[:] = 0.0
         only[0, loose[1, r]] = 1.0
-        one[0, 0], one[1, 0] = at[0, i], at[1, i]
-        columns(chips[i : i + 1], one, moved, only, table, wave)
+        one[:, 0] = at[:, i]
+        columns(chips[i : i + 1], one, moved, only, tables, wave)
         stack[free - last + r] = wave[0, 0]
 
 
@@ -227,14 +227,14 @@ def solve_once(stack: F8, lamps: F8, common: F8, loose_precision: F8, noise: F8,
 
 @kernel("void(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[:,::1])")
 def leave(stack: F8, lamps: F8, scale: F8, theta: F8, out: F8) -> None:
-    """Residual of the last step's solution, and the derivative of the whole signal by a common phase.
+    """Residual of the last step's solution, derivative of the whole signal by a common phase, and the nuisance part.
 
     Args:
         stack: as for :func:`solve_once`.
         lamps: after it.
         scale: amplitudes before it.
         theta: its solution.
-        out: (2, N) out.
+        out: (3, N) out.
     """
     n, size, free = lamps.shape[1], stack.shape[1], theta.shape[0] - 1
     weights = np.empty(free)
@@ -247,7 +247,7 @@ def leave(stack: F8, lamps: F8, scale: F8, theta: F8, out: F8) -> None:
     q, y = stack[free : stack.shape[0] - 1], stack[stack.shape[0] - 1]
     for k in range(size):
         out[0, k] = y[k] - signal[k]
-    slow = mixed(inner(q, out[0]), q)
+    out[2] = mixed(inner(q, out[0]), q)
     for k in range(size):
-        out[0, k] -= slow[k]
+        out[0, k] -= out[2, k]
     out[1] = mixed(lamps[AMPLITUDE], stack[n : 2 * n])

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.cdma.correlation_kernels import gram, inner
+from estimator.cdma.correlation_kernels import gram, inner, invert, mixed, tones
 from estimator.numerics.arrays import Array
 
 FUNDAMENTALS_HZ: Final = (100.0, 120.0)
@@ -27,6 +27,9 @@ GAIN: Final = 0.5
 JUMP: Final = 5e-4
 """Limit of the relative frequency error of one block: a larger one is a disturbance, not the grid."""
 
+RIDGE: Final = 1e-9
+"""Relative and absolute regularisation of rows that masked samples make alike."""
+
 _COS, _SIN, _T_COS, _T_SIN = 3, 4, 5, 6
 
 
@@ -34,13 +37,13 @@ def basis(times: Array, frequency: float, harmonics: int) -> Array:
     """Rows to be projected out, (5 + 2 * harmonics, N), not orthogonal; ``frequency`` in cycles per unit of time."""
     middle = 0.5 * (times[0] + times[-1])
     t = 2.0 * (times - middle) / (times[-1] - times[0])
-    tone = np.exp(2j * np.pi * frequency * (times - middle))
-    rows = [np.ones_like(t), t, t * t, tone.real, tone.imag, t * tone.real, t * tone.imag]
-    power = tone
-    for _ in range(2, harmonics + 1):
-        power = power * tone
-        rows += [power.real, power.imag]
-    return np.array(rows)
+    multiples, rows = np.empty((2 * harmonics, len(t))), np.empty((5 + 2 * harmonics, len(t)))
+    tones(frequency, times - middle, multiples)
+    rows[0], rows[1], rows[2] = 1.0, t, t * t
+    rows[_COS], rows[_SIN] = multiples[0], multiples[harmonics]
+    rows[_T_COS], rows[_T_SIN] = t * rows[_COS], t * rows[_SIN]
+    rows[7 : 6 + harmonics], rows[6 + harmonics :] = multiples[1:harmonics], multiples[harmonics + 1 :]
+    return rows
 
 
 def orthonormal(rows: Array) -> tuple[Array, Array]:
@@ -48,7 +51,10 @@ def orthonormal(rows: Array) -> tuple[Array, Array]:
     products = np.empty((len(rows), len(rows)))
     gram(rows, len(rows), products)
     lower = np.linalg.inv(np.linalg.cholesky(products))
-    return np.einsum("ij,jk->ik", lower, rows), np.asarray(lower, np.float64)
+    out = np.empty_like(rows)
+    for k, (row, weights) in enumerate(zip(out, lower, strict=True)):
+        row[:] = mixed(weights[: k + 1].copy(), rows[: k + 1])
+    return out, np.asarray(lower, np.float64)
 
 
 class Mains:
@@ -77,11 +83,26 @@ class Mains:
 
     def learn(self, y: Array) -> None:
         """Track the flicker of an undisturbed block, for the next one."""
-        self._follow(inner(self.rows(y), y), GAIN, JUMP)
+        self._follow(self._coefficients(self.rows(y), y), self._built[1], GAIN, JUMP, len(y))
+
+    def learn_masked(self, y: Array, mask: Array, more: Array) -> None:
+        """The same for a block with masked samples; ``more``: (M, N) rows of other light in it."""
+        own = self.basis(np.arange(len(y), dtype=np.float64))
+        rows = np.concatenate((own * mask, more))
+        products = np.empty((len(rows), len(rows)))
+        gram(rows, len(rows), products)
+        products[np.diag_indices(len(rows))] *= 1.0 + RIDGE
+        products[np.diag_indices(len(rows))] += RIDGE
+        invert(products)
+        self._follow(inner(products, inner(rows, y)), self._frequency, GAIN, JUMP, len(y))
 
     def masked(self, times: Array, mask: Array) -> Array:
         """Orthonormal rows for a block with masked samples or a corrected time base; ``times`` in samples."""
-        return orthonormal(basis(times, self._frequency, self._harmonics) * mask)[0]
+        return orthonormal(self.basis(times) * mask)[0]
+
+    def basis(self, times: Array) -> Array:
+        """Rows of the subspace (M, N), not orthogonal; ``times`` in samples."""
+        return basis(times, self._frequency, self._harmonics)
 
     def _fresh(self, size: int) -> Array:
         """Basis for blocks of this size, recomputed if size or frequency changed."""
@@ -93,10 +114,13 @@ class Mains:
             self._built = (size, self._frequency)
         return self._q
 
-    def _follow(self, coefficient: Array, gain: float, jump: float) -> None:
+    def _coefficients(self, q: Array, y: Array) -> Array:
+        """Coefficients of the basis, from the products of its orthonormal rows."""
+        return inner(self._upper, inner(q, y))
+
+    def _follow(self, coefficients: Array, built: float, gain: float, jump: float, size: int) -> None:
         """First-order frequency correction: a frequency error looks like t times the quadrature of the sinusoid."""
-        c = inner(self._upper, coefficient).tolist()
-        size, built = self._built
+        c = coefficients.tolist()
         power = c[_COS] ** 2 + c[_SIN] ** 2 + c[_T_COS] ** 2 + c[_T_SIN] ** 2
         if power > 0.0:
             found = built + (c[_T_COS] * c[_SIN] - c[_T_SIN] * c[_COS]) / (np.pi * (size - 1) * power)
@@ -110,7 +134,7 @@ class Mains:
         for hertz in FUNDAMENTALS_HZ:
             self._frequency = self._nominal = hertz / self._rate
             for _ in range(3):
-                self._follow(inner(self._fresh(len(y)), y), 1.0, PULL)
+                self._follow(self._coefficients(self._fresh(len(y)), y), self._built[1], 1.0, PULL, len(y))
             left = inner(self._fresh(len(y)), y)
             tried.append((float(y @ y - left @ left), self._frequency, self._nominal))
         _, self._frequency, self._nominal = min(tried)

@@ -59,6 +59,7 @@ class Prior:
         lag_var, clock_var: of the common delay (chips^2) and of the relative sample clock.
         amplitude: ADC steps, of the last block; only ranks the lamps by strength.
         bit_sum, bit_weight: soft bit of the first code period touched, from the last block.
+        pulse: number of each lamp's pulse table.
     """
 
     chips: Array
@@ -70,10 +71,11 @@ class Prior:
     amplitude: Array
     bit_sum: Array
     bit_weight: Array
+    pulse: Array
 
     def lamps(self, more: Array | float = 0.0) -> Array:
-        """(2, L) phases, plus a correction ``more`` (chips), and rates, in the layout of the kernels."""
-        return rows_of(self.phase + more, self.rate)
+        """(3, L) phases, plus a correction ``more`` (chips), rates, and pulse tables, in the layout of the kernels."""
+        return rows_of(self.phase + more, self.rate, self.pulse)
 
 
 @dataclass(eq=False)
@@ -88,6 +90,7 @@ class Fit:
         soft, soft_var: (L, P) amplitude times data sign of each code period touched; variance inf where not touched.
         signs: (L, P) data signs used, 0 where left out.
         mixed_slope: (N,) derivative of the whole signal by a common phase.
+        nuisance: (N,) fitted mains and PWM light.
     """
 
     amplitude: Array
@@ -105,6 +108,7 @@ class Fit:
     soft_var: Array
     signs: Array
     mixed_slope: Array
+    nuisance: Array
 
     @property
     def clearest(self) -> float:

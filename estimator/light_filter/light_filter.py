@@ -208,7 +208,7 @@ def result(lights: Lights) -> LightsResult:
         return describe(lights, [], None)
     fresh = describe(lights, list(lights.result.links), None)
     old = lights.result
-    return replace(fresh, accepted=old.accepted, block=old.block, clock_ppm=old.clock_ppm)
+    return replace(fresh, accepted=old.accepted, block=old.block, clock_ppm=old.clock_ppm, pwm=old.pwm, slow=old.slow)
 
 
 def look_around(lights: Lights, epoch: LightEpoch) -> None:
@@ -373,6 +373,8 @@ def describe(
         clock_ppm=epoch.clock_ppm if epoch is not None else None,
         t_pose=lights.course.t_mono,
         bent=lights.bent.anew,
+        pwm=epoch.pwm if epoch is not None else (),
+        slow=epoch.slow if epoch is not None else frozenset(),
     )
 
 

@@ -38,7 +38,7 @@ def test_the_table_explains_the_simulated_light(name: str, code: int) -> None:
     start = np.floor((x[0] + phase) / profile.length) * profile.length
     touched = int((x[-1] - x[0]) / profile.length) + 3
     lamps = np.array([[phase - start], [1.0]])
-    columns(chips, lamps, np.stack([x, np.ones_like(x)]), np.ones((1, touched)), pulse_table(profile), out)
+    columns(chips, lamps, np.stack([x, np.ones_like(x)]), np.ones((1, touched)), pulse_table(profile)[None], out)
     value, ramp = out[0, 0], np.linspace(-1, 1, len(t))
     rows = np.array([value, np.ones_like(t), ramp, ramp**2]).T
     weights = np.linalg.lstsq(rows, y, rcond=None)[0]

@@ -15,7 +15,7 @@ from estimator.cdma.air_interface import PROFILE_A
 from estimator.cdma.chip_pulse import STEPS, pulse_table
 from estimator.cdma.gold_codes import gold_codes
 
-TABLE = pulse_table(PROFILE_A)
+TABLE = pulse_table(PROFILE_A)[None]
 
 
 def waves(phase: list[float], rate: list[float], x: np.ndarray, signs: np.ndarray) -> SimpleNamespace:
@@ -29,7 +29,7 @@ def slow_value(chips: np.ndarray, signs: np.ndarray, u: float) -> float:
     """Linear interpolation in the table, chip by chip over an endless code."""
 
     def pulse(column: int, fraction: float) -> float:
-        return float(np.interp(fraction * STEPS, np.arange(STEPS + 1), TABLE[:, column]))
+        return float(np.interp(fraction * STEPS, np.arange(STEPS + 1), TABLE[0, :, column]))
 
     def chip(at: int) -> float:
         return float(chips[at % 127] * signs[max(at // 127, 0)])

@@ -18,7 +18,7 @@ from tools.sim.light.waveform import Block, Ceiling
 pytestmark = pytest.mark.jit
 
 LSB = PROFILE_A.front_end.lsb_a
-TABLE = pulse_table(PROFILE_A)
+TABLE = pulse_table(PROFILE_A)[None]
 
 
 class Bench:
@@ -46,7 +46,7 @@ class Bench:
         few, amplitude = len(lamps), block.truth_a / LSB
         return Prior(
             gold_codes(7)[[lamp.code for lamp in lamps]], phase - 127.0 * first + off, rate, np.full(few, sigma**2),
-            0.05**2, (1e-4) ** 2, amplitude, np.zeros(few), np.zeros(few),
+            0.05**2, (1e-4) ** 2, amplitude, np.zeros(few), np.zeros(few), np.zeros(few),
         )  # fmt: skip
 
 

@@ -136,3 +136,31 @@ class Lamp:
         current = self.current_a + self.slope_a_s * when
         level = current * np.where(bright, 1.0 + self.depth, 1.0 - self.depth)
         return when, np.diff(level, prepend=0.0)
+
+
+@dataclass(frozen=True)
+class PwmLamp:
+    """A dimmed lamp that carries no code: on and off at one frequency.
+
+    Attributes:
+        hertz: frequency. swing_a: photocurrent while it is on. duty: share of the time. phase: of the rise, cycles.
+    """
+
+    hertz: float
+    swing_a: float
+    duty: float = 0.5
+    phase: float = 0.0
+
+    @property
+    def current_a(self) -> float:
+        """Mean photocurrent."""
+        return self.swing_a * self.duty
+
+    def edges(self, begin: float, end: float) -> tuple[Array, Array]:
+        """Times of all edges within [begin, end] and the jump of photocurrent at each."""
+        cycles = np.arange(np.ceil(begin * self.hertz), np.floor(end * self.hertz) + 1.0)
+        rise = (cycles + self.phase % 1.0) / self.hertz
+        when = np.concatenate((rise, rise + self.duty / self.hertz))
+        jump = np.repeat((self.swing_a, -self.swing_a), len(rise))
+        inside = when <= end
+        return when[inside], jump[inside]

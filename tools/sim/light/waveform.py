@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from tools.sim.light.transmitter import Lamp
+from tools.sim.light.transmitter import Lamp, PwmLamp
 
 Array = npt.NDArray[np.float64]
 ELECTRON = 1.602e-19
@@ -109,7 +109,7 @@ class Block:
 
 @dataclass
 class Ceiling:
-    """All of it; `block` may be asked for any time, in any order."""
+    """All of it; `block` may be asked for any time, in any order. ``dimmed``: PWM lamps, which carry no code."""
 
     lamps: list[Lamp]
     ambient: Ambient = field(default_factory=Ambient)
@@ -118,6 +118,7 @@ class Ceiling:
     chip_rate: float = 5000.0
     degree: int = 7
     seed: int = 0
+    dimmed: list[PwmLamp] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(self.seed)
@@ -144,6 +145,7 @@ class Ceiling:
     def _signal(self, t_sample: Array) -> Array:
         begin = t_sample[0] - SETTLE / (2 * np.pi * self.receiver.hpf_hz)
         pairs = [lamp.edges(begin, t_sample[-1], self.chip_rate, self.degree) for lamp in self.lamps]
+        pairs += [lamp.edges(begin, t_sample[-1]) for lamp in self.dimmed]
         if not pairs:
             return np.zeros_like(t_sample)
         when = np.concatenate([pair[0] for pair in pairs])
@@ -163,7 +165,7 @@ class Ceiling:
     def _noise(self, samples: int) -> Array:
         """Shot and thermal noise, and the converter's own beyond that of rounding."""
         rx = self.receiver
-        mean = self.ambient.current_a + sum(lamp.current_a for lamp in self.lamps)
+        mean = self.ambient.current_a + sum(lamp.current_a for lamp in (*self.lamps, *self.dimmed))
         shot = np.sqrt(ELECTRON * mean * self.bus.scl_hz / self.bus.clocks_per_sample)
         step = rx.full_scale_a / 2**rx.bits
         rounding = step / np.sqrt(12)

@@ -1,0 +1,1 @@
+"""Explanations of what the joint fit leaves over: twins of one code, slow lamps, saturation, regular pauses."""

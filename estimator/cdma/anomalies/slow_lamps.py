@@ -1,0 +1,199 @@
+"""Slow lamps: light that rises and falls later than the air interface allows, as of phosphor or a weak driver.
+
+A slow lamp leaves the derivative of its pulse by the square of the rise time in the residual. As long as no lamp is
+slow, that is all that is averaged. Once there is one, a Kalman filter estimates the squares of all lamps and the corner
+of the low-pass together, and each slow lamp gets a pulse table of its own.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from estimator.cdma.air_interface import Profile
+from estimator.cdma.chip_pulse import SLOW_S, Shape, slow_loss
+from estimator.cdma.correlation_kernels import columns, inner, mixed
+from estimator.cdma.sample_block import Fit, Prior, Sampled, rows_of
+from estimator.numerics.arrays import Array
+
+Index = npt.NDArray[np.int64]
+
+SOON, LATER, SELDOM, SETTLED = 4, 16, 64, 6
+"""Blocks between two updates: `SOON` for the first `SETTLED` updates after a lamp was found, then `LATER`; `SELDOM` as
+long as no lamp is slow.
+"""
+
+MEMORY: Final = 0.9
+"""Weight of the earlier updates, as long as no lamp is slow."""
+
+EVIDENT: Final = 6.0
+"""Sigmas from which a lamp is slow."""
+
+SMALLEST: Final = (5e-6) ** 2
+"""Excess of the square of the rise time, s^2, from which a lamp is slow; it stays slow down to half of it."""
+
+SUSPECT: Final = 0.04
+"""Relative corner error from which slow lamps may be the cause."""
+
+CORNER, SQUARE = 0.05, (20e-6) ** 2
+"""Sigmas of the corner and of a squared rise time, s^2, before any measurement."""
+
+CORNER_WALK, SQUARE_WALK = 3e-4, 2e-12
+"""Sigmas of their change from update to update."""
+
+FURTHER_S, SLOWEST_S = 12e-6, 60e-6
+"""Largest growth of a rise time at once, and largest rise time, s."""
+
+ASTRAY: Final = 5.0
+"""Correction in sigmas from which the estimates are astray: the next block counts as if it were the first."""
+
+DOUBT: Final = 0.25
+"""Share of the correction that is added to the sigma of an amplitude: a light need not rise exponentially."""
+
+
+class SlowLamps:
+    """Rise time of the lamp in each slot."""
+
+    def __init__(self, profile: Profile, slots: int) -> None:
+        """No slow lamp."""
+        self._usual_s, self._loss = profile.front_end.led_tau_s, slow_loss(profile)
+        self._code = np.full(slots, -1)
+        self._sums = np.zeros((2, slots))  # excess of the square by weight, weight
+        self._excess, self._covariance = np.zeros(slots), np.eye(slots + 1)
+        self._slow = np.zeros(slots, np.bool_)
+        self._wait, self._updates = SOON, 0
+        self._joint, self._astray = False, True
+
+    def learn(self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, slots: Index, codes: Index) -> None:
+        """Learn from one more block, every few blocks; the corner, too, once there are slow lamps."""
+        if not self._joint:
+            shape.learn(block, prior, fit)
+            if abs(shape.corner - 1.0) > SUSPECT:
+                self._estimate_jointly(shape)
+        self._wait -= 1
+        if self._wait:
+            return
+        self._updates += 1
+        self._start(slots[self._code[slots] != codes], shape)
+        self._code[slots] = codes
+        self._wait = SOON if self._updates < SETTLED else LATER if self._joint else SELDOM
+        if self._joint:
+            self._estimate(block, prior, fit, shape, slots)
+        elif self._test(block, prior, fit, shape, slots):
+            self._estimate_jointly(shape)
+
+    def _estimate_jointly(self, shape: Shape) -> None:
+        """From now on estimate the corner with the rise times, beginning with the usual values."""
+        self._joint, self._wait = True, 1
+        shape.set_corner(1.0)
+
+    def _start(self, slots: Index, shape: Shape) -> None:
+        """Forget what was known of these slots: they have other lamps now."""
+        if not len(slots):
+            return
+        self._updates = 0
+        self._sums[:, slots], self._slow[slots] = 0.0, False
+        self._excess[slots], shape.rise_s[slots] = 0.0, self._usual_s
+        self._covariance[slots], self._covariance[:, slots] = 0.0, 0.0
+        self._covariance[slots, slots] = 1.0
+
+    def _test(self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, slots: Index) -> bool:
+        """Average the excess that the residual indicates; returns whether a lamp is evidently slow."""
+        change, _ = self._derivatives(block, prior, fit, shape, None)
+        energy = np.maximum(np.einsum("ij,ij->i", change, change), 1e-12)
+        seen = rows_of(inner(change, fit.residual), energy) / fit.noise_var
+        self._sums[:, slots] = MEMORY * self._sums[:, slots] + seen
+        excess, weight = self._sums[0, slots], self._sums[1, slots]
+        return bool(((excess > 0.5 * SMALLEST * weight) & (excess > EVIDENT * np.sqrt(weight))).any())
+
+    def _derivatives(
+        self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, by_corner: Array | None
+    ) -> tuple[Array, Array]:
+        """Derivatives (L, N) of each lamp's light by its squared rise time, and of all light by the corner (N,).
+
+        They are without what the amplitude and the phase of the lamp explain.
+        """
+        lamps = prior.lamps(fit.phase + fit.lag)
+        lamps[1] *= 1.0 + fit.clock
+        own, change, common = (np.zeros((2, len(fit.amplitude), len(block.x))) for _ in range(3))
+        columns(prior.chips, lamps, block.samples, fit.signs, shape.tables, own)
+        columns(prior.chips, lamps, block.samples, fit.signs, shape.derivatives, change)
+        rows = _without(change[0], own) * fit.amplitude[:, None]
+        if by_corner is None:
+            return rows, common[0, 0]
+        columns(prior.chips, lamps[:2].copy(), block.samples, fit.signs, by_corner[None], common)
+        return rows, mixed(fit.amplitude, _without(common[0], own))
+
+    def _estimate(self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, slots: Index) -> None:
+        """Kalman update of the squared rise times and the corner, in units of their first sigmas."""
+        by_rise, by_corner = self._derivatives(block, prior, fit, shape, shape.by_corner)
+        rows = np.array([block.project(row) for row in (*(by_rise * SQUARE), by_corner * CORNER)])
+        off = shape.corner - shape.made_corner
+        ahead = np.append(self._ahead(slots, shape) / SQUARE, off / CORNER)
+        left = fit.residual - mixed(ahead, rows)  # beyond what the tables do not contain yet
+        seen = np.ix_(*(np.append(slots, -1),) * 2)
+        if self._astray:
+            self._covariance[seen] = np.eye(len(rows))
+        covariance = np.linalg.inv(
+            np.linalg.inv(self._covariance[seen]) + np.einsum("ik,jk->ij", rows, rows) / fit.noise_var
+        )
+        step = (covariance * (inner(rows, left) / fit.noise_var)).sum(axis=1)
+        self._astray = bool((np.abs(step) > ASTRAY * np.sqrt(np.diag(covariance))).any())
+        walk = np.append(np.full(len(slots), SQUARE_WALK / SQUARE), CORNER_WALK / CORNER)
+        covariance[np.diag_indices(len(rows))] += walk**2
+        self._covariance[seen] = covariance
+        moved, before = SQUARE * step[:-1], self._excess[slots]
+        most = (np.sqrt(np.maximum(before + self._usual_s**2, 0.0)) + FURTHER_S) ** 2
+        self._excess[slots] = np.clip(before + moved, -(self._usual_s**2), np.minimum(most, SLOWEST_S**2))
+        shape.set_corner(shape.corner + CORNER * float(step[-1]))
+        if self._astray:
+            self._wait = 1
+        self._decide(slots, shape)
+
+    def _decide(self, slots: Index, shape: Shape) -> None:
+        """Decide which lamps are slow."""
+        enough = np.where(self._slow[slots], 0.5, 1.0)
+        evident = np.maximum(SMALLEST, EVIDENT * self._sigma(slots))
+        self._slow[slots] = self._excess[slots] > enough * evident
+        rise_s = np.sqrt(np.maximum(self._excess[slots] + self._usual_s**2, 0.0))
+        shape.rise_s[slots] = np.where(self._slow[slots], rise_s, self._usual_s)
+
+    def _ahead(self, slots: Index, shape: Shape) -> Array:
+        """Squared rise times beyond those of the present tables."""
+        ahead: Array = self._excess[slots] + self._usual_s**2 - shape.made_s[slots] ** 2
+        return ahead
+
+    def _sigma(self, slots: Index) -> Array:
+        """Sigma of the squared rise times."""
+        sigma: Array = SQUARE * np.sqrt(np.maximum(self._covariance[slots, slots], 0.0))
+        return sigma
+
+    def slow(self, slots: Index) -> npt.NDArray[np.bool_]:
+        """Which of these lamps are slow."""
+        slow: npt.NDArray[np.bool_] = self._slow[slots]
+        return slow
+
+    def pulse(self, slots: Index, codes: Index, shape: Shape) -> Array:
+        """Number of the pulse table of each of these lamps."""
+        pulse: Array = shape.pulse[slots] * (self._code[slots] == codes)
+        return pulse
+
+    def spread(self, slots: Index, amplitude: Array, shape: Shape) -> Array | float:
+        """Variance of the amplitudes by the uncertainty of the rise times."""
+        if not self._joint:
+            return 0.0
+        off = np.abs(self._ahead(slots, shape)) + self._sigma(slots)
+        by_rise = self._loss * off / (SLOW_S**2 - self._usual_s**2)
+        return ((DOUBT * shape.loss[slots]) ** 2 + by_rise**2) * amplitude**2
+
+
+def _without(rows: Array, own: Array) -> Array:
+    """Rows (L, N) without what value and slope (2, L, N) of the same lamp explain."""
+    value, slope = own
+    vv, ss, vs = (np.einsum("ij,ij->i", a, b) for a, b in ((value, value), (slope, slope), (value, slope)))
+    v, s = np.einsum("ij,ij->i", value, rows), np.einsum("ij,ij->i", slope, rows)
+    inverse = 1.0 / np.maximum(vv * ss - vs * vs, 1e-12)
+    out: Array = rows - ((ss * v - vs * s) * inverse)[:, None] * value - ((vv * s - vs * v) * inverse)[:, None] * slope
+    return out
