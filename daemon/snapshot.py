@@ -155,6 +155,9 @@ NO_CONDITION: Final = Condition()
 LISTED_LINKS: Final = 16
 """Largest number of links in a snapshot; the strongest are listed."""
 
+LISTED_DIMMED: Final = 3
+"""Largest number of PWM-dimmed lamps in a snapshot: as many as the decoder follows."""
+
 
 @dataclass(frozen=True, slots=True)
 class LightLink:
@@ -173,6 +176,29 @@ class LightLink:
 
 
 @dataclass(frozen=True, slots=True)
+class DimmedLamp:
+    """A PWM-dimmed lamp in view, which carries no code.
+
+    Attributes:
+        hertz: its frequency. swing: photocurrent between off and on, A.
+        other_hertz: a frequency that the samples cannot tell from it; None: the frequency is certain.
+    """
+
+    hertz: float
+    swing: float
+    other_hertz: float | None = None
+
+    def __str__(self) -> str:
+        """As in "a PWM lamp of 1.0 kHz, 5 uA"."""
+        other = "" if self.other_hertz is None else f" or {_frequency(self.other_hertz)}"
+        return f"a PWM lamp of {_frequency(self.hertz)}{other}, {1e6 * self.swing:.2g} uA"
+
+
+def _frequency(hertz: float) -> str:
+    return f"{hertz / 1e3:.1f} kHz" if hertz >= 999.5 else f"{hertz:.0f} Hz"
+
+
+@dataclass(frozen=True, slots=True)
 class LightPicture:
     """The light solution, which does not use the lidar's position; None: not available.
 
@@ -181,7 +207,7 @@ class LightPicture:
         t_mono: end of the latest usable block of samples. pose: T_map_base. sigma: of x, y, yaw (m, rad).
         floor: diffuse floor, as a share of a lamp's own light. clock_ppm: error of the sample clock.
         blocks, blocks_lost: received since the start, and those of them that are unusable.
-        links: strongest first.
+        links: strongest first. dimmed: PWM-dimmed lamps in view.
     """
 
     fix: LightFix = LightFix.NONE
@@ -194,6 +220,7 @@ class LightPicture:
     blocks: int = 0
     blocks_lost: int = 0
     links: tuple[LightLink, ...] = ()
+    dimmed: tuple[DimmedLamp, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

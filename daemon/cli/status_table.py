@@ -11,7 +11,7 @@ from typing import Any, Final
 from daemon.publish.modbus import integrity_block, parts_block, registers, timing_block
 from daemon.publish.modbus.client import Reading
 from daemon.publish.modbus.points import U16, Value
-from daemon.snapshot import GUESSED, LISTED_LINKS, LightFix, LinkUse, Stage, State
+from daemon.snapshot import GUESSED, LISTED_DIMMED, LISTED_LINKS, DimmedLamp, LightFix, LinkUse, Stage, State
 
 _TOP: Final = U16.span[1] / 10_000  # where ages and sigmas, 16 bits of 0.1 ms or 0.1 mm, saturate
 _GUESS: Final = "  (unconfirmed pose)"
@@ -51,6 +51,14 @@ def _links(reading: Reading) -> Iterator[dict[str, Any]]:
         if (code := reading[f"link_{row}_code"]) is not None:
             link = {name: reading[f"link_{row}_{name}"] for name in ("lamp", "use", "strength", "residual")}
             yield {"code": code, **link, "use": _name(LinkUse, link["use"])}
+
+
+def _dimmed(reading: Reading) -> Iterator[DimmedLamp]:
+    """Yields the PWM-dimmed lamps in view; none from a daemon of a version without their block."""
+    for row in range(1, LISTED_DIMMED + 1):
+        hertz, swing = reading.get(f"dimmed_{row}_frequency"), reading.get(f"dimmed_{row}_swing")
+        if hertz is not None and swing is not None:
+            yield DimmedLamp(hertz, swing, reading[f"dimmed_{row}_other"])
 
 
 def as_table(reading: Reading, stalled: bool) -> str:
@@ -203,6 +211,7 @@ def _lights(reading: Reading) -> list[tuple[str, str]]:
     )
     rows.append(("light pose", _pose(reading, "light")))
     rows.append(("", f"sigma {_triple(reading, names, 'm', '')}"))
+    rows += [("" if k else "dimmed", str(lamp)) for k, lamp in enumerate(_dimmed(reading))]
     links = list(_links(reading))
     if links:
         rows.append(("links", f"{'lamp':>6} {'code':>5} {'RSS':>12} {'residual':>9}  use"))

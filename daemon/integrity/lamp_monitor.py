@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from daemon.health.faults import Fault
+from daemon.integrity.light_disturbance import LightDisturbances
 from estimator import UNUSABLE, BlockFlag, Fix, LightsResult, Link, LinkState
 
 log = logging.getLogger(__name__)
@@ -65,6 +66,7 @@ class LampWatch:
     faults: frozenset[Fault] = frozenset()
     stalled: int = 0
     odd: dict[int, tuple[Fault, float]] = field(default_factory=dict)
+    _disturbances: LightDisturbances = field(default_factory=LightDisturbances)
     _lamps: dict[tuple[int, Fault], _Lasting] = field(default_factory=dict)
     _dark: _Lasting = field(default_factory=lambda: _Lasting(LASTS_S))
     _twin: _Lasting = field(default_factory=lambda: _Lasting(TWIN_S))
@@ -74,6 +76,7 @@ class LampWatch:
         """Update after one step; ``fresh``: the step consumed a block of samples."""
         if lights is None or not fresh:
             return
+        self._disturbances.on_result(t_mono, lights)
         if lights.block & UNUSABLE:
             self.stalled += BlockFlag.STALLED in lights.block
             self._pass_on(t_mono)

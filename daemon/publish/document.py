@@ -14,6 +14,7 @@ from daemon.publish.document_udp import udp_page
 from daemon.publish.meanings import COMMANDS, FIXES, LOOPS, STATES, USES
 from daemon.publish.modbus import (
     counts,
+    dimmed_block,
     holding,
     integrity_block,
     lights_block,
@@ -26,7 +27,7 @@ from daemon.publish.modbus import (
 from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.holding import CommandCode
 from daemon.publish.modbus.rtu import PATIENCE_S, SILENCE_S
-from daemon.snapshot import LISTED_LINKS, LightFix, LinkUse, LoopReason, State
+from daemon.snapshot import LISTED_DIMMED, LISTED_LINKS, LightFix, LinkUse, LoopReason, State
 
 
 def _state_rows() -> list[tuple[str, ...]]:
@@ -165,6 +166,7 @@ The same values as IEEE 754 float32 in SI units, and the full covariance of the 
 {_integrity()}
 {_pulse()}
 {_parts()}
+{_dimmed()}
 {_writing()}
 {_serial()}
 ## Limits
@@ -251,6 +253,21 @@ All present faults, the restarts of each part, and the uptime. An uptime that be
 {_whole(block)}
 
 {table(("bit of `hanging`", "name", "what hangs, and what then"), _thread_rows())}
+"""
+
+
+def _dimmed() -> str:
+    first, last = _span(block := dimmed_block.BLOCK)
+    every = layout_rows(block, block.body, 1)
+    lamps = [row for row in every if row[1].startswith("`dimmed_")]
+    one, head = lamps[: len(lamps) // LISTED_DIMMED], every[: -len(lamps)]
+    first_lamp, second_lamp = (int(lamps[k][0]) for k in (0, len(one)))
+    return f"""## Dimmed lamps: input registers {first} to {last}
+
+PWM-dimmed lamps in view ([Receiver](receiver.md#dimmed-lamps-and-other-light)). Read **{block.registers} registers from
+address {first} in one request**. Lamp k of {LISTED_DIMMED} begins at {first_lamp} + {second_lamp - first_lamp} (k - 1).
+
+{_whole(block, [*head, *one])}
 """
 
 

@@ -17,7 +17,7 @@ from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import lru_cache
 from importlib import import_module
-from pkgutil import iter_modules
+from pkgutil import walk_packages
 from types import FunctionType
 from typing import Annotated, Any, Final, cast
 from weakref import WeakSet
@@ -32,7 +32,10 @@ MODULES: Final = {
     "estimator": tuple(f"estimator.{name}" for name in ("job_queue", "measurements", "result", "state")),
     "cycle": (
         *("daemon.snapshot", "daemon.devices.conversion", "daemon.health.faults", "daemon.health.reasons"),
-        *(f"daemon.integrity.{name}" for name in ("position_alert", "arrival_monitor", "observer", "lamp_monitor")),
+        *(
+            f"daemon.integrity.{name}"
+            for name in ("position_alert", "arrival_monitor", "observer", "lamp_monitor", "light_disturbance")
+        ),
         *(f"daemon.integrity.{name}" for name in ("laser_hysteresis", "state_machine", "evidence", "state_memory")),
         *("daemon.integrity.input_monitor", "daemon.integrity.motion_consistency"),
         *("daemon.runtime.inbox", "daemon.runtime.scan_period", "daemon.runtime.snapshot_builder"),
@@ -263,6 +266,6 @@ def _modules(group: str) -> Iterator[str]:
         yield from MODULES[group]
         return
     package = import_module(f"estimator.{group}")
-    for found in iter_modules(package.__path__, f"{package.__name__}."):
+    for found in walk_packages(package.__path__, f"{package.__name__}."):
         if found.name not in APART:
             yield found.name

@@ -10,9 +10,11 @@ import numpy as np
 
 from daemon.integrity.state_memory import Memory
 from daemon.snapshot import (
+    LISTED_DIMMED,
     LISTED_LINKS,
     Condition,
     CycleTiming,
+    DimmedLamp,
     LightFix,
     LightLink,
     LightPicture,
@@ -154,6 +156,7 @@ def _light(result: StepResult | None, facts: Facts, links: tuple[LightLink, ...]
         blocks=facts.blocks,
         blocks_lost=facts.blocks_lost,
         links=links,
+        dimmed=tuple([DimmedLamp(lamp.hertz, lamp.swing_a, lamp.other_hertz) for lamp in lights.pwm[:LISTED_DIMMED]]),
     )
 
 

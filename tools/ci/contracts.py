@@ -31,7 +31,15 @@ from daemon.health.faults import FAULTS
 from daemon.health.reasons import REASONS
 from daemon.maps import container
 from daemon.publish import udp_subscriptions
-from daemon.publish.modbus import holding, integrity_block, lights_block, parts_block, registers, timing_block
+from daemon.publish.modbus import (
+    dimmed_block,
+    holding,
+    integrity_block,
+    lights_block,
+    parts_block,
+    registers,
+    timing_block,
+)
 from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.points import Layout
 from daemon.publish.stream import fields as stream_fields
@@ -57,6 +65,7 @@ def contracts() -> Contracts:
         "modbus integrity": _block(integrity_block.BLOCK),
         "modbus cycle": _block(timing_block.BLOCK),
         "modbus parts": _block(parts_block.BLOCK),
+        "modbus dimmed lamps": _block(dimmed_block.BLOCK),
         "modbus holding": _contract(0, _holding_registers()),
         "numbers": _contract(0, _numbers()),
         "pose datagram": _contract(registers.VERSION, _datagram()),

@@ -7,7 +7,7 @@ from typing import Any, Final
 from daemon.cli.reports.output import meaning, name_of, pose, zoned
 from daemon.publish.modbus import integrity_block, parts_block, registers, timing_block
 from daemon.publish.modbus.client import Reading
-from daemon.snapshot import LISTED_LINKS, LightFix, LinkUse, LoopReason, Stage, State
+from daemon.snapshot import LISTED_DIMMED, LISTED_LINKS, LightFix, LinkUse, LoopReason, Stage, State
 
 AXES: Final = ("x", "y", "yaw")
 
@@ -111,6 +111,7 @@ def _lights(reading: Reading) -> dict[str, Any] | None:
         "blocks": reading["blocks"],
         "blocks_lost": reading["blocks_lost"],
         "links": links,
+        "dimmed": _dimmed(reading),
     }
 
 
@@ -122,6 +123,19 @@ def _link(reading: Reading, row: int) -> dict[str, Any]:
         "strength_a": reading[f"link_{row}_strength"],
         "residual_ln": reading[f"link_{row}_residual"],
     }
+
+
+def _dimmed(reading: Reading) -> list[dict[str, Any]]:
+    """The PWM-dimmed lamps in view; none from a daemon of a version without their block."""
+    return [
+        {
+            "frequency_hz": hertz,
+            "other_frequency_hz": reading[f"dimmed_{row}_other"],
+            "swing_a": reading[f"dimmed_{row}_swing"],
+        }
+        for row in range(1, LISTED_DIMMED + 1)
+        if (hertz := reading.get(f"dimmed_{row}_frequency")) is not None
+    ]
 
 
 def _cycle(reading: Reading) -> dict[str, Any]:

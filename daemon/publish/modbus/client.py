@@ -8,7 +8,7 @@ import struct
 import time
 from typing import Final
 
-from daemon.publish.modbus import lights_block, registers
+from daemon.publish.modbus import dimmed_block, lights_block, registers
 from daemon.publish.modbus.block import Block
 from daemon.publish.modbus.points import Value
 from daemon.publish.modbus.requests import BLOCKS
@@ -92,7 +92,7 @@ class Reader:
                 ) from error
             reading = self._reading(answer)
             for block in BLOCKS:
-                if block is not lights_block.BLOCK or reading["links"] is not None:
+                if block not in (lights_block.BLOCK, dimmed_block.BLOCK) or reading["links"] is not None:
                     reading |= self._block(block)
             return reading
         raise NoAnswer(

@@ -34,7 +34,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterResponse,
 )
 
-from daemon.publish.modbus import integrity_block, lights_block, parts_block, timing_block
+from daemon.publish.modbus import dimmed_block, integrity_block, lights_block, parts_block, timing_block
 from daemon.publish.modbus.holding import Holding, Refused
 from daemon.publish.modbus.identification import READ_DEVICE_IDENTIFICATION, identify, objects_of
 from daemon.publish.modbus.registers import MIRROR_ADDRESS, MIRROR_WORDS
@@ -60,7 +60,7 @@ _FIXED_BODY: Final = 5  # function, address, count or value
 _READ_WRITE_HEAD: Final = 10  # function, address and count of both, number of bytes
 
 Make = Callable[[], bytes]
-BLOCKS: Final = (lights_block.BLOCK, integrity_block.BLOCK, timing_block.BLOCK, parts_block.BLOCK)
+BLOCKS: Final = (lights_block.BLOCK, integrity_block.BLOCK, timing_block.BLOCK, parts_block.BLOCK, dimmed_block.BLOCK)
 """The blocks beside the first one, by address."""
 _BESIDE: Final = ((MIRROR_ADDRESS, MIRROR_WORDS), *((block.address, block.registers) for block in BLOCKS))
 """First address and size of the blocks beside the first one, in the order in which :meth:`Responder.show` takes them.

@@ -128,6 +128,14 @@ class Link(msgspec.Struct, frozen=True, kw_only=True):
     residual: float | None = None
 
 
+class DimmedLamp(msgspec.Struct, frozen=True, kw_only=True):
+    """One PWM-dimmed lamp in view; see `daemon.snapshot.DimmedLamp`."""
+
+    hertz: float
+    swing: float
+    other_hertz: float | None = None
+
+
 class Lights(msgspec.Struct, frozen=True, kw_only=True):
     """Topic ``lights``: the light solution; see `daemon.snapshot.LightPicture`. Empty: no photodiode."""
 
@@ -141,6 +149,7 @@ class Lights(msgspec.Struct, frozen=True, kw_only=True):
     blocks: int = 0
     blocks_lost: int = 0
     links: tuple[Link, ...] = ()
+    dimmed: tuple[DimmedLamp, ...] = ()
 
 
 class Scan(msgspec.Struct, frozen=True, kw_only=True):

@@ -7,6 +7,7 @@ const NEAR_PX = 22;      // of a tap from a lamp
 
 const signed = (part) => `${part >= 0 ? "+" : "−"}${Math.abs(100 * part).toFixed(1)} %`;
 const amperes = (a) => (a >= 1e-6 ? `${(1e6 * a).toFixed(2)} µA` : `${(1e9 * a).toFixed(a < 1e-7 ? 1 : 0)} nA`);
+const frequency = (hertz) => (hertz >= 999.5 ? `${(hertz / 1000).toFixed(1)} kHz` : `${Math.round(hertz)} Hz`);
 const residual = (link) => (link.residual == null ? "–" : signed(Math.expm1(link.residual)));
 
 export class Lamps {
@@ -26,6 +27,7 @@ export class Lamps {
     const fix = this.world.scene.fixes[lights.fix] || ["", ""];
     put("fix", `light fix ${fix[0]} · ${lights.used} used`);
     $("fix").title = fix[1];
+    this.dimmed(lights.dimmed || []);
     const key = lights.links.map((link) => `${link.code},${link.use},${link.strength.toPrecision(3)},${(link.residual || 0).toFixed(2)}`).join();
     if (this.shown === key) return;
     this.shown = key;
@@ -45,6 +47,20 @@ export class Lamps {
     bar.append(fill, element("span", "", use[0].toLowerCase()));
     row.append(element("span", "id", link.lamp_id === null ? `code ${link.code}` : String(link.lamp_id)), bar, element("span", "s", amperes(link.strength)), element("span", "r", residual(link)));
     return row;
+  }
+
+  // PWM-dimmed lamps, which carry no code.
+  dimmed(lamps) {
+    const rows = lamps.map(({ hertz, other_hertz: other, swing }) => [`${frequency(hertz)}${other == null ? "" : ` or ${frequency(other)}`}`, `${Number((1e6 * swing).toPrecision(2))} µA`]);
+    const key = JSON.stringify(rows);
+    if (this.dimmedShown === key) return;
+    this.dimmedShown = key;
+    $("dimmed").hidden = !rows.length;
+    $("dimmed").replaceChildren(...rows.map(([name, text]) => {
+      const row = element("div");
+      row.append(element("dt", "", `PWM lamp of ${name}`), element("dd", "", text));
+      return row;
+    }));
   }
 
   // The lamp at a point of the screen; null: none there.

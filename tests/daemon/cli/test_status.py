@@ -25,7 +25,7 @@ from daemon.config.schema import Config, ModbusConfig
 from daemon.publish.modbus import client, lights_block, registers
 from daemon.publish.modbus.parts_block import PARTS
 from daemon.publish.modbus.requests import BLOCKS
-from daemon.snapshot import Condition, Part, Snapshot, State, Thread, Trust
+from daemon.snapshot import Condition, DimmedLamp, Part, Snapshot, State, Thread, Trust
 from tests.daemon.publish.modbus.test_lights_block import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import publishing
@@ -183,7 +183,8 @@ def test_a_program_reads_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_every_published_value_is_in_the_report() -> None:
     """Each is changed by itself; the report has to change with it."""
-    taken = snapshot(light=picture(), links=3)
+    dimmed = tuple(DimmedLamp(1000.0 * row, 1e-6) for row in (1, 2, 3))
+    taken = snapshot(light=picture(dimmed=dimmed), links=3)
     reading = registers.decode_block(registers.encode_block(taken))
     for block in BLOCKS:
         reading |= block.decode(block.encode(taken)) | {"seq": reading["seq"]}
@@ -198,7 +199,8 @@ def test_every_published_value_is_in_the_report() -> None:
 
 
 def test_a_report_names_the_units() -> None:
-    taken = snapshot(light=picture(), links=3)
+    dimmed = tuple(DimmedLamp(1000.0 * row, 1e-6) for row in (1, 2, 3))
+    taken = snapshot(light=picture(dimmed=dimmed), links=3)
     reading = registers.decode_block(registers.encode_block(taken))
     for block in BLOCKS:
         reading |= block.decode(block.encode(taken)) | {"seq": reading["seq"]}

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.publish.stream.messages import Loop, MapTiles, Scan
-from daemon.snapshot import LightFix, LightLink, LightPicture, LinkUse, State, Trust
+from daemon.snapshot import DimmedLamp, LightFix, LightLink, LightPicture, LinkUse, State, Trust
 from taps.access_guard import Guard
 from taps.view.page_hello import Scene
 from tests.taps.view.house import TOKEN, House, serving, snapshot
@@ -95,13 +95,14 @@ def scan_at(seq: int, t: float) -> Scan:
 
 
 def light_at(t: float) -> LightPicture:
-    """Six lamps, some of which are not used."""
+    """Six lamps, some of which are not used, and one that is dimmed by PWM."""
     x, y, _ = pose_at(t)
     links = tuple(
         LightLink(code, lamp, use, 2e-6 / (1.0 + math.hypot(lx - x, ly - y)) ** 2, 0.02 * (k - 2))
         for k, ((lamp, code, lx, ly), use) in enumerate(zip(LAMPS, USES, strict=True))
     )
-    return LightPicture(LightFix.GOOD, 3, t, pose_at(t), (0.01, 0.02, 0.03), 0.1, 3.0, 7, 0, links[:5])
+    dimmed = (DimmedLamp(15_000.0, 4.96e-6, 7222.2),)
+    return LightPicture(LightFix.GOOD, 3, t, pose_at(t), (0.01, 0.02, 0.03), 0.1, 3.0, 7, 0, links[:5], dimmed)
 
 
 def told_at(seq: int, **other: Any) -> Any:

@@ -147,6 +147,7 @@ def test_the_state_is_seen_at_once(browser: str, tmp_path: Path) -> None:
         apart = "((a, b) => a.right <= b.left || a.bottom <= b.top || b.bottom <= a.top)"
         boxes = ", ".join(f"document.querySelector('{name}').getBoundingClientRect()" for name in (".legend", ".tools"))
         assert await page.js(f"{apart}({boxes})")  # nothing is covered
+        assert (await text(page, "#dimmed")).split("\n") == ["PWM lamp of 15.0 kHz or 7.2 kHz", "5 µA"]
         heads = await page.js("[...document.querySelectorAll('.link.heads span')].map((one) => one.textContent)")
         assert heads == ["lamp", "use", "RSS", "residual"]
         await page.js("lumiloop.link.take = () => {}")

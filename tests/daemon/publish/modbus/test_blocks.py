@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 
 from daemon.publish import document
-from daemon.publish.modbus import integrity_block, lights_block, parts_block, registers, timing_block
+from daemon.publish.modbus import dimmed_block, integrity_block, lights_block, parts_block, registers, timing_block
 from daemon.publish.modbus.points import Layout
 from daemon.publish.modbus.requests import BLOCKS, Responder
 from daemon.snapshot import LightFix, LinkUse, LoopReason, Part, Snapshot, Stage, Thread
+from tests.daemon.publish.modbus.test_dimmed_block import DIMMED
 from tests.daemon.publish.modbus.test_integrity_block import TRUST
 from tests.daemon.publish.modbus.test_lights_block import picture
 from tests.daemon.publish.modbus.test_parts_block import CONDITION
@@ -68,6 +69,9 @@ CASES = {
             "parts": {part.name: part.value for part in Part},
             "threads": {thread.name: thread.value for thread in Thread},
         },
+    ),
+    "dimmed": Case(
+        dimmed_block.BLOCK, snapshot(light=picture(dimmed=DIMMED)), 440, 24, (444, 2), ((440, 25), (439, 1)), {}
     ),
 }  # fmt: skip
 EACH = pytest.mark.parametrize("name", CASES)
@@ -140,7 +144,7 @@ def test_the_contract_is_the_frozen_one(name: str) -> None:
 def test_the_pages_name_each_place(name: str) -> None:
     case, modbus, udp = CASES[name], document.modbus_page(), document.udp_page()
     for offset, point in zip(case.block.offsets, case.block.points, strict=True):
-        if not point.name.startswith("link_") or point.name.startswith("link_1_"):
+        if not point.name.startswith(("link_", "dimmed_")) or point.name.startswith(("link_1_", "dimmed_1_")):
             assert f"| {case.address + 2 + offset} | `{point.name}` | {point.wire.name} |" in modbus
     if case.tail:
         for offset, point in zip(case.tail[0].offsets, case.tail[0].points, strict=True):
@@ -151,3 +155,9 @@ def test_the_page_places_all_links() -> None:
     names = [point.name for point in lights_block.BLOCK.points]
     assert lights_block.BLOCK.offsets[names.index("link_3_code")] == 222 - 202 + 12
     assert "begins at 222 + 6 (k - 1)" in document.modbus_page()
+
+
+def test_the_page_places_all_dimmed_lamps() -> None:
+    names = [point.name for point in dimmed_block.BLOCK.points]
+    assert dimmed_block.BLOCK.offsets[names.index("dimmed_3_frequency")] == 444 - 442 + 12
+    assert "Lamp k of 3 begins at 444 + 6 (k - 1)" in document.modbus_page()
