@@ -12,6 +12,7 @@ import numpy.typing as npt
 from estimator.cdma.acquisition import DOMINANCE, Job, Outcome, Search
 from estimator.cdma.acquisition_budget import Watch
 from estimator.cdma.air_interface import Profile
+from estimator.cdma.anomalies.residual_colour import Colour
 from estimator.cdma.anomalies.saturation import unsteadiness
 from estimator.cdma.anomalies.slow_lamps import SlowLamps
 from estimator.cdma.anomalies.time_base import TimeBase
@@ -57,7 +58,8 @@ RESTED: Final = 3
 """Blocks after a twin was found until the next test: the twin is judged, and all lamps are tracked meanwhile."""
 
 UNTESTED: Final = 32
-"""Blocks without any sign of a twin until one of the strongest lamps, in turn, is tested for one."""
+"""Blocks without a candidate until one of the strongest lamps, in turn, is tested for a twin, if the residual is not
+white."""
 
 
 ASTRAY: Final = 0.3
@@ -92,6 +94,7 @@ class Decoder:
         self.stalled = 0
         self.time_base = TimeBase()
         self.slow_lamps = SlowLamps(profile, CAPACITY)
+        self.colour = Colour()
         self.untested, self.rank = RESTED, 0
         self.odd = 0
         self.noise = 0.0
@@ -121,10 +124,12 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     tracks, clocks = decoder.tracks, decoder.clocks
     tracks.merge_twins()
     excess = max(block.t_end - block.t_begin - len(sampled.x) / block.rate * (1.0 + clocks.clock), 0.0)
+    clocks.measure((block.t_end - block.t_begin) * block.rate / len(sampled.x) - 1.0)
     decoder.time_base.on_stamps(clocks.known and excess > TOO_LONG_S)
     if not len(tracks.slots):
         clocks.rest()
         decoder.background.learn(sampled.y, sampled.clean)
+        decoder.colour.learn(sampled.clean)
         return BlockFlag.NONE, replace(sampled, y=sampled.clean)
     flags, solved = _solve(decoder, sampled, _find_lag(decoder, sampled, excess))
     found = int(flags)
@@ -147,7 +152,8 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
             tracks.learn_phases(tracks.slots, solved.fit)
         _live_and_die(decoder, solved, suspicious=noisy)
     if not found & (_STALLED | _MENDED):
-        decoder.background.learn(solved.fit.residual + solved.fit.nuisance, solved.fit.residual)
+        decoder.background.learn_beyond(solved.fit)
+        decoder.colour.learn(solved.fit.residual)
     lasting = not noisy or decoder.odd >= PATIENCE
     if lasting and not found & ~(_CLIPPED | _NOISY) and len(tracks.confirmed):
         codes = tracks.code[tracks.slots]
@@ -168,7 +174,7 @@ def _add_twin(decoder: Decoder, solved: _Solved, flags: int, unsteady: float) ->
         return False
     only = None
     if not (flags & _UNUSUAL or trying.any()):
-        if decoder.untested < RESTED + UNTESTED:
+        if decoder.untested < RESTED + UNTESTED or not decoder.colour.coloured:
             return False
         decoder.rank = only = (decoder.rank + 1) % LEADING
     twin = find_twin(solved.block, solved.prior, solved.fit, decoder.shape, decoder.profile, only)
@@ -218,8 +224,13 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
         rows = decoder.background.masked(np.arange(len(sampled.y), dtype=np.float64), sampled.mask)
         sampled = Sampled(sampled.y, sampled.x, sampled.mask, rows)
         fit = joint_fit(sampled, prior, tables)
-    solved = _Solved(sampled, prior, lag, fit)
     verdict = judge(sampled, fit, decoder.usual_noise)
+    if verdict.skewed:
+        clocks.doubt()
+        prior = prior_at(0.0)
+        fit = joint_fit(sampled, prior, tables)
+        verdict = judge(sampled, fit, decoder.usual_noise)
+    solved = _Solved(sampled, prior, lag, fit)
     _listen(decoder, fit)
     if len(tracks.confirmed):
         decoder.time_base.learn(fit.mixed_slope, fit.residual, fit.noise_var)
@@ -255,8 +266,8 @@ def _weigh(decoder: Decoder, fit: Fit, unsteady: float) -> None:
     tracks, slots = decoder.tracks, decoder.tracks.slots
     excess = max(fit.noise_var - (QUIET * decoder.usual_noise) ** 2, 0.0) if decoder.usual_noise else 0.0
     crossed = CROSSED**2 * excess / pulse_energy(decoder.profile)
-    variance = fit.amplitude_var + crossed + (unsteady * fit.amplitude) ** 2
-    tracks.weigh(slots, fit.amplitude, variance + decoder.slow_lamps.spread(slots, fit.amplitude, decoder.shape))
+    relative_var = unsteady**2 + decoder.slow_lamps.spread(slots, decoder.shape)
+    tracks.weigh(slots, fit.amplitude, fit.amplitude_var + crossed, relative_var)
     decoder.noise = float(np.sqrt(fit.noise_var))
 
 

@@ -58,12 +58,14 @@ class Verdict:
 
     Attributes:
         bent: phases differ over the block. loud: the residual is far larger than usual.
+        skewed: phases change steadily over the block, which no pause does, but an error of the sample clock.
         smooth: and the residual is mains flicker, which a pause has torn, not the light of an untracked lamp.
     """
 
     bent: bool
     loud: bool
     smooth: bool
+    skewed: bool = False
 
     @property
     def good(self) -> bool:
@@ -92,7 +94,16 @@ def judge(block: Sampled, fit: Fit, usual_noise: float) -> Verdict:
     rest = max(left - explained, 1e-12) / len(block.y)
     bent = explained / PARTS > BENT * rest and float(np.max(np.abs(overlap / energy))) > SMALLEST
     loud = usual_noise > 0.0 and fit.noise_var > (LOUD * usual_noise) ** 2
-    return Verdict(bent, loud, loud and _slow_energy(fit.residual) > SMOOTH * left)
+    skewed = bent and _is_ramp(overlap / energy, energy)
+    return Verdict(bent, loud, loud and _slow_energy(fit.residual) > SMOOTH * left, skewed)
+
+
+def _is_ramp(shift: Array, weight: Array) -> bool:
+    """Whether a ramp explains these shifts of the parts of a block better than any step does."""
+    trials = np.concatenate((np.linspace(-1.0, 1.0, PARTS)[None], np.tri(PARTS, PARTS, -1)[1:]))
+    trials = trials - (trials * weight).sum(axis=1, keepdims=True) / weight.sum()
+    explained = (trials * weight * shift).sum(axis=1) ** 2 / (trials**2 * weight).sum(axis=1)
+    return int(np.argmax(explained)) == 0
 
 
 @lru_cache(maxsize=64)

@@ -77,13 +77,7 @@ def cut(chips: F8, lamps: F8, samples: F8, index: I8, count: int, tables: F8, dr
     mixed[:] = 0.0
     for r in range(count):
         i, p, low, high = index[0, r], index[1, r], index[2, r], index[3, r]
-        code, row, rate, phase, table = (
-            chips[i],
-            out[r],
-            lamps[1, i],
-            lamps[0, i],
-            tables[int(lamps[2, i]) if lamps.shape[0] > 2 else 0],
-        )
+        code, row, rate, phase, table = chips[i], out[r], lamps[1, i], lamps[0, i], tables[int(lamps[2, i])]
         before = code[length - 1] if p == 0 else 0.0  # the sign of the period before the first is not resolved
         for _ in range(p):
             phase -= length

@@ -58,6 +58,12 @@ LONGEST_S: Final = 1e6
 UNTRIED: Final = 1.5e-4
 """One sigma of a sample clock that is stored (good to 200 ppm) or comes from a search."""
 
+MISTAKEN: Final = 1e-3
+"""One sigma of a sample clock that lamps contradict: an eighth of a chip at the ends of a block."""
+
+STRETCH_GAIN: Final = 0.125
+"""Share of a block in the averaged distance of samples by the time stamps."""
+
 FINEST: Final = 3e-4
 """Minimum sigma of a phase, chips (errors of the pulse shape)."""
 
@@ -83,7 +89,8 @@ _FREE, _TENTATIVE, _CONFIRMED = (int(life) for life in Life)
 class Clocks:
     """Clocks that all lamps share: delay and drift (chips, chips per chip), and the sample clock's relative error.
 
-    ``clock`` is positive when samples are farther apart than nominal.
+    ``clock`` is positive when samples are farther apart than nominal. ``stretch``: the same by the time stamps of the
+    blocks alone, averaged; it contains the delay of the stamps.
     """
 
     def __init__(self, profile: Profile, clock_ppm: float | None) -> None:
@@ -94,6 +101,7 @@ class Clocks:
         self.clock_var = UNTRIED**2
         self.proven, self._proven_var = self.clock, self.clock_var
         self.guess: float | None = None
+        self.stretch = 0.0
         self.state = np.zeros(2)  # delay, drift
         self.cov = np.diag([(STAMP_S * self._chip_rate) ** 2, (3e-5) ** 2])
 
@@ -116,6 +124,14 @@ class Clocks:
         self.clock += fit.clock * (1.0 + self.clock)
         self.clock_var = max(fit.clock_var, 1e-14)
 
+    def measure(self, stretch: float) -> None:
+        """Average the time between a block's stamps over that of its samples at the nominal clock, less 1."""
+        self.stretch += STRETCH_GAIN * (stretch - self.stretch)
+
+    def doubt(self) -> None:
+        """Widen the prior of the sample clock: lamps contradict it."""
+        self.clock_var = max(self.clock_var, MISTAKEN**2)
+
     def prove(self) -> None:
         """Store the sample clock as proven, because a confirmed lamp depends on it."""
         self.known, self.guess = True, None
@@ -133,7 +149,12 @@ class Clocks:
 
 
 class Tracks:
-    """Slots of tracked lamps. Phases are in chips at time ``t``, without the common delay, never wrapped."""
+    """Slots of tracked lamps. Phases are in chips at time ``t``, without the common delay, never wrapped.
+
+    Attributes:
+        amplitude, amplitude_var: ADC steps, variance by noise alone. relative_var: variance of a common factor of
+            errors, which makes no lamp less certain to be there. shared: whether two lamps may have one code.
+    """
 
     def __init__(self, profile: Profile) -> None:
         """All slots free."""
@@ -146,10 +167,11 @@ class Tracks:
         self.code: Index = np.zeros(CAPACITY, np.int64)
         self.phase, self.rate = np.zeros(CAPACITY), np.zeros(CAPACITY)
         self.cov = np.zeros((CAPACITY, 2, 2))
-        self.amplitude, self.amplitude_var = np.zeros(CAPACITY), np.zeros(CAPACITY)
+        self.amplitude, self.amplitude_var, self.relative_var = np.zeros((3, CAPACITY))
         self._dark = np.zeros(CAPACITY, bool)
         self.hits: Index = np.zeros(CAPACITY, np.int64)
         self.misses: Index = np.zeros(CAPACITY, np.int64)
+        self.shared = False
         self.rings = BitRings(CAPACITY)
         self.frames: list[LampFrame | None] = [None] * CAPACITY
 
@@ -196,6 +218,7 @@ class Tracks:
         if len(known) or not len(free):
             return
         k = int(free[0])
+        self.shared |= bool(same.any())
         self.life[k], self.code[k] = Life.TENTATIVE, code
         self.frames[k] = None
         self._place(k, phase, t)
@@ -207,6 +230,7 @@ class Tracks:
         if not len(free):
             return
         k = int(free[0])
+        self.shared = True
         self.life[k], self.code[k] = Life.TENTATIVE, self.code[slot]
         self.frames[k] = None
         self._place(k, float(self.phase[slot]) + shift, self.t)
@@ -219,10 +243,11 @@ class Tracks:
 
     def merge_twins(self) -> None:
         """Drop the weaker of two lamps of one code that have come too close to be separated."""
+        if not self.shared:
+            return
         slots = self.slots
         codes = self.code[slots]
-        if len(set(codes.tolist())) == len(slots):
-            return
+        self.shared = len(set(codes.tolist())) < len(slots)
         for k, slot in enumerate(slots.tolist()):
             others = slots[:k][codes[:k] == codes[k]]
             apart = np.abs(
@@ -246,9 +271,12 @@ class Tracks:
         dark: npt.NDArray[np.bool_] = self._dark[slots]
         return dark
 
-    def weigh(self, slots: Index, amplitude: Array, variance: Array) -> None:
-        """Store the amplitudes of a block. A faint lamp needs more to return: chance reaches 5 sigmas now and then."""
-        self.amplitude[slots], self.amplitude_var[slots] = amplitude, variance
+    def weigh(self, slots: Index, amplitude: Array, variance: Array, relative_var: Array | float) -> None:
+        """Store the amplitudes of a block. A faint lamp needs more to return: chance reaches 5 sigmas now and then.
+
+        ``variance``: by noise; ``relative_var``: of errors that grow with the amplitude.
+        """
+        self.amplitude[slots], self.amplitude_var[slots], self.relative_var[slots] = amplitude, variance, relative_var
         self._dark[slots] = amplitude < np.where(self._dark[slots], CLEAR, FAINT) * np.sqrt(variance)
 
     def drop(self, slot: int) -> None:

@@ -11,6 +11,7 @@ Use::
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from typing import Final
 
@@ -58,6 +59,9 @@ _DISTURBED, _ODD = ~int(BlockFlag.UNEVEN | BlockFlag.OVERDRIVEN), int(BlockFlag.
 _UNUSUAL, _UNUSABLE = ~int(USUAL), int(UNUSABLE)
 _FAINT, _TWIN, _SLOW = int(LinkFlag.FAINT), int(LinkFlag.TWIN), int(LinkFlag.SLOW)
 """Flags as plain numbers: enum operations are slow."""
+
+SLOWEST: Final = 0.03
+"""Largest relative distance of samples that pauses of the bus may add; more of them leave no code intact."""
 
 FULL_ROUND: Final = 8
 """Sweeps without a confirmed lamp until all sample clocks are tried."""
@@ -166,7 +170,8 @@ def _sweep(decoder: Decoder, codes: int) -> int:
 def _trial_clocks(decoder: Decoder) -> list[float]:
     """Clocks to try: the known one alone, or the whole range.
 
-    The range is used while none is known, and again when the known one confirms no lamp.
+    The range is used while none is known, and again when the known one confirms no lamp. It reaches beyond that of the
+    profile if the time stamps show that the bus pauses.
     """
     tracks, clocks = decoder.tracks, decoder.clocks
     if (clocks.known or clocks.guess is not None or len(tracks.slots)) and decoder.barren < FULL_ROUND:
@@ -177,7 +182,8 @@ def _trial_clocks(decoder: Decoder) -> list[float]:
             tracks.drop(int(slot))
         decoder.offered = None
     reach = round(decoder.profile.clock_ppm * 1e-6 / BIN)
-    return [k * BIN for k in range(-reach, reach + 1)]
+    slowest = max(reach, math.ceil(min(clocks.stretch, SLOWEST) / BIN))
+    return [k * BIN for k in range(-reach, slowest + 1)]
 
 
 def _take(decoder: Decoder, job: Job, clock: float, found: list[Found]) -> int:
@@ -269,7 +275,7 @@ def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch
         t_end=block.t_end,
         ids=code,
         amplitude=amplitude * lsb,
-        variance=(variance + (decoder.time_base.doubt * amplitude) ** 2) * lsb**2,
+        variance=(variance + (tracks.relative_var[links] + decoder.time_base.doubt**2) * amplitude**2) * lsb**2,
         flags=faint * _FAINT + twin * _TWIN + slow * _SLOW,
         lamps=tuple([tracks.frames[k] for k in links.tolist()]),
         block=flags,

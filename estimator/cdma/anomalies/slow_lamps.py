@@ -20,7 +20,7 @@ from estimator.numerics.arrays import Array
 
 Index = npt.NDArray[np.int64]
 
-SOON, LATER, SELDOM, SETTLED = 4, 16, 64, 6
+SOON, LATER, SELDOM, SETTLED = 4, 16, 128, 6
 """Blocks between two updates: `SOON` for the first `SETTLED` updates after a lamp was found, then `LATER`; `SELDOM` as
 long as no lamp is slow.
 """
@@ -44,7 +44,8 @@ CORNER_WALK, SQUARE_WALK = 3e-4, 2e-12
 """Sigmas of their change from update to update."""
 
 FURTHER_S, SLOWEST_S = 12e-6, 60e-6
-"""Largest growth of a rise time at once, and largest rise time, s."""
+"""Largest growth of a rise time at once, and largest rise time, s. A step that is too long is shortened as a whole:
+the corner must not make up for what is cut off."""
 
 ASTRAY: Final = 5.0
 """Correction in sigmas from which the estimates are astray: the next block counts as if it were the first."""
@@ -146,8 +147,10 @@ class SlowLamps:
         self._covariance[seen] = covariance
         moved, before = SQUARE * step[:-1], self._excess[slots]
         most = (np.sqrt(np.maximum(before + self._usual_s**2, 0.0)) + FURTHER_S) ** 2
-        self._excess[slots] = np.clip(before + moved, -(self._usual_s**2), np.minimum(most, SLOWEST_S**2))
-        shape.set_corner(shape.corner + CORNER * float(step[-1]))
+        part = min(1.0, float(((most - before) / np.maximum(moved, 1e-30))[moved > 0.0].min(initial=1.0)))
+        self._astray |= part < 1.0
+        self._excess[slots] = np.clip(before + part * moved, -(self._usual_s**2), SLOWEST_S**2)
+        shape.set_corner(shape.corner + part * CORNER * float(step[-1]))
         if self._astray:
             self._wait = 1
         self._decide(slots, shape)
@@ -177,16 +180,19 @@ class SlowLamps:
 
     def pulse(self, slots: Index, codes: Index, shape: Shape) -> Array:
         """Number of the pulse table of each of these lamps."""
+        if not self._joint:
+            return np.zeros(len(slots))
         pulse: Array = shape.pulse[slots] * (self._code[slots] == codes)
         return pulse
 
-    def spread(self, slots: Index, amplitude: Array, shape: Shape) -> Array | float:
-        """Variance of the amplitudes by the uncertainty of the rise times."""
+    def spread(self, slots: Index, shape: Shape) -> Array | float:
+        """Relative variance of the amplitudes by the uncertainty of the rise times."""
         if not self._joint:
             return 0.0
         off = np.abs(self._ahead(slots, shape)) + self._sigma(slots)
         by_rise = self._loss * off / (SLOW_S**2 - self._usual_s**2)
-        return ((DOUBT * shape.loss[slots]) ** 2 + by_rise**2) * amplitude**2
+        spread: Array = (DOUBT * shape.loss[slots]) ** 2 + by_rise**2
+        return spread
 
 
 def _without(rows: Array, own: Array) -> Array:

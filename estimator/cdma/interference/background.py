@@ -12,6 +12,7 @@ from estimator.cdma.correlation_kernels import inner, mixed
 from estimator.cdma.interference.pwm_lamps import PwmLamps
 from estimator.cdma.interference.pwm_waveform import orthonormal
 from estimator.cdma.mains_rejection import Mains
+from estimator.cdma.sample_block import Fit
 from estimator.numerics.arrays import Array
 
 MOVED: Final = 0.02
@@ -74,4 +75,11 @@ class Background:
 
     def learn(self, light: Array, residual: Array) -> None:
         """Track the PWM lamps, for the next block; ``light``: (N,) a block without coded lamps; its ``residual``."""
-        self.pwm.learn(light, residual, self.mains.rows(light))
+        if self.pwm.due(residual):
+            self.pwm.learn(light, residual, self.mains.rows(light))
+
+    def learn_beyond(self, fit: Fit) -> None:
+        """Track the PWM lamps by what the coded lamps of a fit leave."""
+        if self.pwm.due(fit.residual):
+            light = fit.residual + fit.nuisance
+            self.pwm.learn(light, fit.residual, self.mains.rows(light))

@@ -159,20 +159,22 @@ class PwmLamps:
             self._merge(light - mixed(inner(mains, light), mains), mains)
         if self._tracks:
             self._follow(light - mixed(inner(mains, light), mains), residual, mains)
-        self._unlooked += 1
-        energy = float(np.vdot(residual, residual))
-        if len(self._tracks) < MOST and (self._tracks or self._is_due(energy)):
-            self._unlooked, self._searched = 0, energy
+        if len(self._tracks) < MOST:
             self._look_for(light, residual, mains)
 
-    def _is_due(self, energy: float) -> bool:
-        """Whether to search for the first lamp in a block with this energy in its residual."""
+    def due(self, residual: Array) -> bool:
+        """Whether to learn from a block with this residual (N,): always with a lamp, else when to search for one."""
+        if self._tracks:
+            return True
+        self._unlooked += 1
+        energy = float(np.vdot(residual, residual))
         if energy > LOUDER * self._searched:
             self._interval = LOOK_EVERY
-        due = self._unlooked >= self._interval
-        if due:
-            self._interval = min(2 * self._interval, LOOK_SELDOM)
-        return due
+        if self._unlooked < self._interval:
+            return False
+        self._interval = min(2 * self._interval, LOOK_SELDOM)
+        self._unlooked, self._searched = 0, energy
+        return True
 
     def _merge(self, clean: Array, mains: Array) -> None:
         """Replace two lamps by one if they are multiples of a frequency whose edges explain the light of both."""
