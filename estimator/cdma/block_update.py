@@ -125,7 +125,8 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     tracks.merge_twins()
     excess = max(block.t_end - block.t_begin - len(sampled.x) / block.rate * (1.0 + clocks.clock), 0.0)
     clocks.measure((block.t_end - block.t_begin) * block.rate / len(sampled.x) - 1.0)
-    decoder.time_base.on_stamps(clocks.known and excess > TOO_LONG_S)
+    unknown = 0.0 if clocks.known else decoder.profile.clock_ppm * 1e-6 * (block.t_end - block.t_begin)
+    decoder.time_base.on_stamps(excess - unknown > TOO_LONG_S)
     if not len(tracks.slots):
         clocks.rest()
         decoder.background.learn(sampled.y, sampled.clean)
@@ -240,9 +241,11 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
     if newcomers and not (verdict.bent or verdict.smooth):
         return BlockFlag.NOISY, solved  # the residual comes from the candidates
     mended = mend(sampled, fit, prior_at, tables, decoder.background, decoder.usual_noise)
+    if isinstance(mended, bool) and verdict.slight:
+        return BlockFlag.NONE, solved
     if isinstance(mended, bool):
         return BlockFlag.STALLED if mended else BlockFlag.NOISY, solved
-    if len(tracks.confirmed) >= LEADERS or not newcomers:
+    if mended.block.steps and (len(tracks.confirmed) >= LEADERS or not newcomers):
         pause = mended.block.x - sampled.x
         decoder.time_base.on_pause(mended.block.steps[0], float(pause[-1] + mended.fit.steps[0]))
     return BlockFlag.MENDED, _Solved(mended.block, mended.prior, lag + mended.lag, mended.fit)

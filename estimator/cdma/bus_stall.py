@@ -28,6 +28,11 @@ BENT: Final = 4.0
 stay below 2.
 """
 
+SLIGHT: Final = 0.1
+"""Share of the residual that different phases explain up to which amplitudes suffer no more from it than from noise:
+signals correlate with a lamp by 0.1 rms, noise by 0.03.
+"""
+
 SMALLEST: Final = 0.002
 """Chips: phase differences below this do no harm (0.4 us with profile A)."""
 
@@ -49,7 +54,12 @@ PASSES: Final = 3
 """Passes to find the length of a pause. The mains rows change with it: 1 us of it is 10 nA of 100 Hz flicker."""
 
 MARGIN: Final = 12
-"""Samples masked on both sides of a small pause, whose position is uncertain by a few samples."""
+"""Samples masked on both sides of a small pause, whose position is uncertain by a few samples, and of a burst."""
+
+BURST: Final = 0.25
+"""Share of the residual within 2 `MARGIN` samples from which it is a burst: a flash, a spark, or light that stands
+still. Residuals of a lamp or a pause spread over the block.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +69,7 @@ class Verdict:
     Attributes:
         bent: phases differ over the block. loud: the residual is far larger than usual.
         skewed: phases change steadily over the block, which no pause does, but an error of the sample clock.
+        slight: phases differ evidently, but so little that it hardly changes amplitudes.
         smooth: and the residual is mains flicker, which a pause has torn, not the light of an untracked lamp.
     """
 
@@ -66,6 +77,7 @@ class Verdict:
     loud: bool
     smooth: bool
     skewed: bool = False
+    slight: bool = False
 
     @property
     def good(self) -> bool:
@@ -95,7 +107,8 @@ def judge(block: Sampled, fit: Fit, usual_noise: float) -> Verdict:
     bent = explained / PARTS > BENT * rest and float(np.max(np.abs(overlap / energy))) > SMALLEST
     loud = usual_noise > 0.0 and fit.noise_var > (LOUD * usual_noise) ** 2
     skewed = bent and _is_ramp(overlap / energy, energy)
-    return Verdict(bent, loud, loud and _slow_energy(fit.residual) > SMOOTH * left, skewed)
+    slight = bent and not loud and explained < SLIGHT * left
+    return Verdict(bent, loud, loud and _slow_energy(fit.residual) > SMOOTH * left, skewed, slight)
 
 
 def _is_ramp(shift: Array, weight: Array) -> bool:
@@ -131,7 +144,7 @@ def mend(
     background: Background,
     usual_noise: float,
 ) -> Mended | bool:
-    """Try to explain a block by one pause. If that fails, return whether there is evidence of a pause.
+    """Try to explain a block by a burst or one pause. If that fails, return whether there is evidence of a pause.
 
     Args:
         block: as it was solved.
@@ -142,6 +155,9 @@ def mend(
         usual_noise: ADC steps, to judge the result by.
     """
     verdict = judge(block, fit, usual_noise)
+    without = _without_burst(block, fit, prior_at(0.0), tables, background) if verdict.loud else None
+    if without is not None and judge(without.block, without.fit, usual_noise).good:
+        return without
     evident = verdict.bent or verdict.smooth
     for place in (_large_pause, _small_pause):
         found = place(block, fit, prior_at(fit.lag), tables)
@@ -163,6 +179,22 @@ def mend(
             lag, chips = lag + again.lag, chips + float(again.steps[0])
         evident = True
     return evident
+
+
+def _without_burst(
+    block: Sampled, fit: Fit, prior: Prior, tables: Array, background: Background
+) -> Mended | None:
+    """The block with its loudest samples masked; None if the residual is not concentrated there."""
+    power = np.cumsum(np.concatenate(((0.0,), fit.residual**2)))
+    within = power[2 * MARGIN :] - power[: -2 * MARGIN]
+    begin = int(np.argmax(within))
+    if within[begin] < BURST * power[-1]:
+        return None
+    mask = block.mask.copy()
+    mask[begin : begin + 2 * MARGIN] = 0.0
+    rows = background.masked((block.x - block.x[0]) / (block.x[1] - block.x[0]), mask)
+    quiet = Sampled(block.y * mask, block.x, mask, rows)
+    return Mended(quiet, prior, joint_fit(quiet, prior, tables), 0.0)
 
 
 _Pause = tuple[int, int, int, float, float]

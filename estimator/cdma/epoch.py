@@ -24,7 +24,7 @@ class BlockFlag(IntFlag):
     MALFORMED = 8  # impossible words, rate or times
     LENGTH = 16  # shorter than a code period, or too long to process
     STALLED = 32  # a bus stall inside; amplitudes are not to be used
-    MENDED = 64  # a bus stall inside, corrected
+    MENDED = 64  # a bus stall inside, corrected, or a burst, left out
     NOISY = 128  # residual far above usual: part of the light is not explained
     OVERDRIVEN = 256  # the first stage was saturated for a part; these samples were masked
     UNEVEN = 512  # the bus pauses at the same samples of every block; corrected as far as known

@@ -28,6 +28,9 @@ EVEN_EVERY: Final = 8
 MEDIAN: Final = 1.57
 """Variance of a median over that of a mean."""
 
+TYPICAL: Final = 0.32
+"""Median of the squares of `BLOCKS` normal deviations from their median."""
+
 REPEATED: Final = 3
 """Single pauses at one place, in blocks one after another, that count as a pattern."""
 
@@ -115,6 +118,8 @@ class TimeBase:
         shifts, variances = (np.array(rows) for rows in zip(*self._seen, strict=True))
         self._seen = []
         median, variance = np.median(shifts, axis=0), MEDIAN * np.median(variances, axis=0) / BLOCKS
+        scatter = np.median((shifts - median) ** 2 / variances)  # a residual that is not noise varies more
+        variance *= max(1.0, float(scatter) / TYPICAL)
         excess = float(np.mean(median**2 / variance))
         self._even, self.doubt = excess < SUSPECT, 0.0
         if excess > EVIDENT:
