@@ -135,6 +135,7 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     flags, solved = _solve(decoder, sampled, _find_lag(decoder, sampled, excess))
     found = int(flags)
     noisy, stalled = bool(found & _NOISY), bool(found & _STALLED)
+    slots, codes = tracks.slots, tracks.code[tracks.slots]
     decoder.stalled = decoder.stalled + 1 if stalled else 0
     unsteady = unsteadiness(solved.block.y, solved.fit)
     if unsteady:
@@ -157,9 +158,7 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
         decoder.colour.learn(solved.fit.residual)
     lasting = not noisy or decoder.odd >= PATIENCE
     if lasting and not found & ~(_CLIPPED | _NOISY) and len(tracks.confirmed):
-        codes = tracks.code[tracks.slots]
-        if len(codes) == len(solved.fit.amplitude):  # none has been dropped
-            decoder.slow_lamps.learn(solved.block, solved.prior, solved.fit, decoder.shape, tracks.slots, codes)
+        decoder.slow_lamps.learn(solved.block, solved.prior, solved.fit, decoder.shape, slots, codes)
     return flags, replace(solved.block, y=solved.fit.residual)
 
 

@@ -19,6 +19,7 @@ from estimator.cdma.sample_block import Fit, Prior, Sampled
 from estimator.numerics.arrays import Array
 
 Complex = npt.NDArray[np.complex128]
+Index = npt.NDArray[np.int64]
 
 STEPS: Final = 512
 """Table points per chip; expansion around the nearest is good to 5e-5 of the pulse, to 4e-4 at its corners."""
@@ -144,6 +145,7 @@ class Shape:
         self._profile = profile
         self._wait = SOON
         self._slow: dict[int, _Slow] = {}
+        self._changed = False
         self._usual_s = profile.front_end.led_tau_s
         self.corner = 1.0
         self.rise_s = np.full(slots, self._usual_s)
@@ -204,6 +206,11 @@ class Shape:
         """Set the estimate of the corner, within its tolerance."""
         self.corner = float(np.clip(corner, 1.0 - REACH, 1.0 + REACH))
 
+    @staticmethod
+    def possible(corner: float) -> bool:
+        """Whether a corner lies within its tolerance."""
+        return abs(corner - 1.0) <= REACH
+
     def renew(self) -> Array | None:
         """Recompute a table if the pulse has changed: half a millisecond, so not within a block update.
 
@@ -219,16 +226,33 @@ class Shape:
         return later
 
     def _renew_slow(self) -> bool:
-        """Recompute the table of one slow lamp; returns whether a table has changed."""
+        """Recompute the table of one slow lamp; returns whether all are complete and some have changed.
+
+        All lamps change at once: their ratios are what places are found by.
+        """
         if not self._slow and self.rise_s.max() == self._usual_s:
             return False
         slow = np.flatnonzero(self.rise_s > self._usual_s).tolist()
-        usual = [slot for slot in self._slow if slot not in slow]
-        for slot in usual:
+        for slot in [slot for slot in self._slow if slot not in slow]:
             del self._slow[slot]
+            self._changed = True
         for slot in slow:
-            made, wanted = self._slow.get(slot), float(self.rise_s[slot])
-            if made is None or abs(made.rise_s - wanted) > RISE_WORTH_S or abs(made.corner - self.corner) > WORTH:
-                self._slow[slot] = self._make_slow(wanted)
-                return True
-        return bool(usual)
+            if not self._fits(self._slow.get(slot), slot):
+                self._changed = True
+                alike = next((lamp for lamp in self._slow.values() if self._fits(lamp, slot)), None)
+                self._slow[slot] = alike or self._make_slow(float(self.rise_s[slot]))
+                if alike is None:
+                    return False
+        changed, self._changed = self._changed, False
+        return changed
+
+    def _fits(self, made: _Slow | None, slot: int) -> bool:
+        """Whether a table is that of the lamp in a slot."""
+        if made is None or abs(made.corner - self.corner) > WORTH:
+            return False
+        return abs(made.rise_s - float(self.rise_s[slot])) <= RISE_WORTH_S
+
+    def behind(self, slots: Index) -> bool:
+        """Whether the tables of these lamps are not yet those of the estimates."""
+        late = np.abs(self.rise_s[slots] - self.made_s[slots]) > 2.0 * RISE_WORTH_S
+        return bool(late.any()) or abs(self.corner - self.made_corner) > 2.0 * WORTH

@@ -271,7 +271,7 @@ class Tracks:
         dark: npt.NDArray[np.bool_] = self._dark[slots]
         return dark
 
-    def weigh(self, slots: Index, amplitude: Array, variance: Array, relative_var: Array | float) -> None:
+    def weigh(self, slots: Index, amplitude: Array, variance: Array, relative_var: Array | float = 0.0) -> None:
         """Store the amplitudes of a block. A faint lamp needs more to return: chance reaches 5 sigmas now and then.
 
         ``variance``: by noise; ``relative_var``: of errors that grow with the amplitude.

@@ -2,7 +2,8 @@
 
 A slow lamp leaves the derivative of its pulse by the square of the rise time in the residual. As long as no lamp is
 slow, that is all that is averaged. Once there is one, a Kalman filter estimates the squares of all lamps and the corner
-of the low-pass together, and each slow lamp gets a pulse table of its own.
+of the low-pass together, and each slow lamp gets a pulse table of its own. A square is the sum of one that all lamps
+share, as by one type of driver or a further low-pass of the receiver, and one of the lamp's own.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from estimator.cdma.air_interface import Profile
-from estimator.cdma.chip_pulse import SLOW_S, Shape, slow_loss
+from estimator.cdma.chip_pulse import SLOW_S, Shape, slow_loss, slow_table
 from estimator.cdma.correlation_kernels import columns, inner, mixed
+from estimator.cdma.mains_rejection import orthonormal
 from estimator.cdma.sample_block import Fit, Prior, Sampled, rows_of
 from estimator.numerics.arrays import Array
 
@@ -40,8 +42,17 @@ SUSPECT: Final = 0.04
 CORNER, SQUARE = 0.05, (20e-6) ** 2
 """Sigmas of the corner and of a squared rise time, s^2, before any measurement."""
 
+PINNED: Final = 1e6
+"""Precision of a corner that is at the end of its tolerance."""
+
 CORNER_WALK, SQUARE_WALK = 3e-4, 2e-12
 """Sigmas of their change from update to update."""
+
+SHARED_S: Final = (10e-6, 15e-6, 20e-6, 30e-6, 40e-6, 50e-6)
+"""Rise times, s, that are tried for all lamps together at the start of the joint estimation."""
+
+LEADERS: Final = 4
+"""Lamps, the strongest first, that decide about it."""
 
 FURTHER_S, SLOWEST_S = 12e-6, 60e-6
 """Largest growth of a rise time at once, and largest rise time, s. A step that is too long is shortened as a whole:
@@ -59,10 +70,12 @@ class SlowLamps:
 
     def __init__(self, profile: Profile, slots: int) -> None:
         """No slow lamp."""
+        self._profile = profile
         self._usual_s, self._loss = profile.front_end.led_tau_s, slow_loss(profile)
         self._code = np.full(slots, -1)
         self._sums = np.zeros((2, slots))  # excess of the square by weight, weight
-        self._excess, self._covariance = np.zeros(slots), np.eye(slots + 1)
+        self._own, self._common = np.zeros(slots), 0.0
+        self._covariance = np.eye(slots + 2)
         self._slow = np.zeros(slots, np.bool_)
         self._wait, self._updates = SOON, 0
         self._joint, self._astray = False, True
@@ -71,10 +84,10 @@ class SlowLamps:
         """Learn from one more block, every few blocks; the corner, too, once there are slow lamps."""
         if not self._joint:
             shape.learn(block, prior, fit)
-            if abs(shape.corner - 1.0) > SUSPECT:
-                self._estimate_jointly(shape)
         self._wait -= 1
-        if self._wait:
+        suspect = not self._joint and abs(shape.corner - 1.0) > SUSPECT
+        if (self._wait and not suspect) or (self._joint and shape.behind(slots)):
+            self._wait = max(self._wait, 1)
             return
         self._updates += 1
         self._start(slots[self._code[slots] != codes], shape)
@@ -82,13 +95,33 @@ class SlowLamps:
         self._wait = SOON if self._updates < SETTLED else LATER if self._joint else SELDOM
         if self._joint:
             self._estimate(block, prior, fit, shape, slots)
-        elif self._test(block, prior, fit, shape, slots):
-            self._estimate_jointly(shape)
+        elif self._test(block, prior, fit, shape, slots) or suspect:
+            self._estimate_jointly(block, prior, fit, shape, slots)
 
-    def _estimate_jointly(self, shape: Shape) -> None:
-        """From now on estimate the corner with the rise times, beginning with the usual values."""
+    def _estimate_jointly(self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, slots: Index) -> None:
+        """From now on estimate the corner with the rise times, beginning with a rise time that all lamps share."""
+        shared = [self._left_by(rise_s, block, prior, fit, shape) for rise_s in (self._usual_s, *SHARED_S)]
+        best = int(np.argmin(shared))
         self._joint, self._wait = True, 1
         shape.set_corner(1.0)
+        if best:
+            self._common = SHARED_S[best - 1] ** 2 - self._usual_s**2
+            self._slow[slots], shape.rise_s[slots] = True, SHARED_S[best - 1]
+
+    def _left_by(self, rise_s: float, block: Sampled, prior: Prior, fit: Fit, shape: Shape) -> float:
+        """Energy of the strongest lamps' light that is left if all of them rise with this time constant."""
+        some = np.argsort(-fit.amplitude)[:LEADERS]
+        lamps = np.ascontiguousarray(prior.lamps(fit.phase + fit.lag)[:, some])
+        lamps[1] *= 1.0 + fit.clock
+        chips, signs = prior.chips[some], np.ascontiguousarray(fit.signs[some])
+        waves = np.empty((2, len(some), len(block.x)))
+        columns(chips, lamps, block.samples, signs, shape.tables, waves)
+        light = block.project(fit.residual + mixed(fit.amplitude[some], waves[0]))
+        lamps[0] += (rise_s - self._usual_s) * self._profile.chip_rate
+        columns(chips, lamps[:2].copy(), block.samples, signs, slow_table(self._profile, rise_s)[None], waves)
+        rows = orthonormal(np.array([block.project(row) for row in waves.reshape(-1, len(block.x))]))[0]
+        weights = inner(rows, light)
+        return float(np.vdot(light, light) - np.vdot(weights, weights))
 
     def _start(self, slots: Index, shape: Shape) -> None:
         """Forget what was known of these slots: they have other lamps now."""
@@ -96,7 +129,7 @@ class SlowLamps:
             return
         self._updates = 0
         self._sums[:, slots], self._slow[slots] = 0.0, False
-        self._excess[slots], shape.rise_s[slots] = 0.0, self._usual_s
+        self._own[slots], shape.rise_s[slots] = 0.0, self._usual_s
         self._covariance[slots], self._covariance[:, slots] = 0.0, 0.0
         self._covariance[slots, slots] = 1.0
 
@@ -134,43 +167,59 @@ class SlowLamps:
         off = shape.corner - shape.made_corner
         ahead = np.append(self._ahead(slots, shape) / SQUARE, off / CORNER)
         left = fit.residual - mixed(ahead, rows)  # beyond what the tables do not contain yet
-        seen = np.ix_(*(np.append(slots, -1),) * 2)
+        rows = np.insert(rows, len(slots), rows[:-1].sum(axis=0), axis=0)
+        seen = np.ix_(*(np.append(slots, (-2, -1)),) * 2)
         if self._astray:
             self._covariance[seen] = np.eye(len(rows))
-        covariance = np.linalg.inv(
-            np.linalg.inv(self._covariance[seen]) + np.einsum("ik,jk->ij", rows, rows) / fit.noise_var
-        )
-        step = (covariance * (inner(rows, left) / fit.noise_var)).sum(axis=1)
+        precision = np.linalg.inv(self._covariance[seen]) + np.einsum("ik,jk->ij", rows, rows) / fit.noise_var
+        pull = inner(rows, left) / fit.noise_var
+        covariance, step = _solved(precision, pull)
+        if not shape.possible(shape.corner + CORNER * float(step[-1])):
+            precision[-1, -1] += PINNED  # the rise times must not make up for what is cut off
+            covariance, step = _solved(precision, pull)
         self._astray = bool((np.abs(step) > ASTRAY * np.sqrt(np.diag(covariance))).any())
-        walk = np.append(np.full(len(slots), SQUARE_WALK / SQUARE), CORNER_WALK / CORNER)
+        walk = np.append(np.full(len(slots) + 1, SQUARE_WALK / SQUARE), CORNER_WALK / CORNER)
         covariance[np.diag_indices(len(rows))] += walk**2
         self._covariance[seen] = covariance
-        moved, before = SQUARE * step[:-1], self._excess[slots]
-        most = (np.sqrt(np.maximum(before + self._usual_s**2, 0.0)) + FURTHER_S) ** 2
-        part = min(1.0, float(((most - before) / np.maximum(moved, 1e-30))[moved > 0.0].min(initial=1.0)))
-        self._astray |= part < 1.0
-        self._excess[slots] = np.clip(before + part * moved, -(self._usual_s**2), SLOWEST_S**2)
-        shape.set_corner(shape.corner + part * CORNER * float(step[-1]))
+        self._move(slots, step, shape)
         if self._astray:
             self._wait = 1
         self._decide(slots, shape)
 
+    def _move(self, slots: Index, step: Array, shape: Shape) -> None:
+        """Apply a step, shortened if it is too long."""
+        moved, before = SQUARE * (step[:-2] + step[-2]), self._excess(slots)
+        most = (np.sqrt(np.maximum(before + self._usual_s**2, 0.0)) + FURTHER_S) ** 2
+        part = min(1.0, float(((most - before) / np.maximum(moved, 1e-30))[moved > 0.0].min(initial=1.0)))
+        self._astray |= part < 1.0
+        self._common = min(max(self._common + part * SQUARE * float(step[-2]), -(self._usual_s**2)), SLOWEST_S**2)
+        self._own[slots] = np.clip(before + part * moved, -(self._usual_s**2), SLOWEST_S**2) - self._common
+        shape.set_corner(shape.corner + part * CORNER * float(step[-1]))
+
     def _decide(self, slots: Index, shape: Shape) -> None:
         """Decide which lamps are slow."""
         enough = np.where(self._slow[slots], 0.5, 1.0)
-        evident = np.maximum(SMALLEST, EVIDENT * self._sigma(slots))
-        self._slow[slots] = self._excess[slots] > enough * evident
-        rise_s = np.sqrt(np.maximum(self._excess[slots] + self._usual_s**2, 0.0))
+        excess = self._excess(slots)
+        all_slow = self._common > EVIDENT * SQUARE * float(np.sqrt(self._covariance[-2, -2]))
+        evident = SMALLEST if all_slow else np.maximum(SMALLEST, EVIDENT * self._sigma(slots))
+        self._slow[slots] = excess > enough * evident
+        rise_s = np.sqrt(np.maximum(excess + self._usual_s**2, 0.0))
         shape.rise_s[slots] = np.where(self._slow[slots], rise_s, self._usual_s)
+
+    def _excess(self, slots: Index) -> Array:
+        """Squared rise times beyond the usual one, s^2."""
+        excess: Array = self._own[slots] + self._common
+        return excess
 
     def _ahead(self, slots: Index, shape: Shape) -> Array:
         """Squared rise times beyond those of the present tables."""
-        ahead: Array = self._excess[slots] + self._usual_s**2 - shape.made_s[slots] ** 2
+        ahead: Array = self._excess(slots) + self._usual_s**2 - shape.made_s[slots] ** 2
         return ahead
 
     def _sigma(self, slots: Index) -> Array:
         """Sigma of the squared rise times."""
-        sigma: Array = SQUARE * np.sqrt(np.maximum(self._covariance[slots, slots], 0.0))
+        own, with_common = self._covariance[slots, slots], self._covariance[slots, -2]
+        sigma: Array = SQUARE * np.sqrt(np.maximum(own + 2.0 * with_common + self._covariance[-2, -2], 0.0))
         return sigma
 
     def slow(self, slots: Index) -> npt.NDArray[np.bool_]:
@@ -193,6 +242,12 @@ class SlowLamps:
         by_rise = self._loss * off / (SLOW_S**2 - self._usual_s**2)
         spread: Array = (DOUBT * shape.loss[slots]) ** 2 + by_rise**2
         return spread
+
+
+def _solved(precision: Array, pull: Array) -> tuple[Array, Array]:
+    """Covariance and step of a Kalman update in information form."""
+    covariance = np.linalg.inv(precision)
+    return covariance, (covariance * pull).sum(axis=1)
 
 
 def _without(rows: Array, own: Array) -> Array:
