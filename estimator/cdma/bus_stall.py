@@ -156,8 +156,10 @@ def mend(
     """
     verdict = judge(block, fit, usual_noise)
     without = _without_burst(block, fit, prior_at(0.0), tables, background) if verdict.loud else None
-    if without is not None and judge(without.block, without.fit, usual_noise).good:
-        return without
+    if without is not None:
+        better = judge(without.block, without.fit, usual_noise)
+        if better.good or better.slight:
+            return without
     evident = verdict.bent or verdict.smooth
     for place in (_large_pause, _small_pause):
         found = place(block, fit, prior_at(fit.lag), tables)

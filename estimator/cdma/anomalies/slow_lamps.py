@@ -239,7 +239,9 @@ class SlowLamps:
         if not self._joint:
             return 0.0
         off = np.abs(self._ahead(slots, shape)) + self._sigma(slots)
-        by_rise = self._loss * off / (SLOW_S**2 - self._usual_s**2)
+        usual = shape.pulse[slots] == 0.0
+        loss, made_s = np.where(usual, self._loss, shape.loss[slots]), np.where(usual, SLOW_S, shape.made_s[slots])
+        by_rise = loss * off / (made_s**2 - self._usual_s**2)
         spread: Array = (DOUBT * shape.loss[slots]) ** 2 + by_rise**2
         return spread
 
