@@ -236,8 +236,8 @@ class Search:
             found.append(Found(int(some[k]), phase, float(amplitude[k]), float(z[k])))
         return found
 
-    def common_lag(self, y: Array, clock: float, lamps: Lamps, window: float) -> float:
-        """Common delay (chips) of all lamps relative to their predicted phases, within ``window`` chips.
+    def common_lag(self, y: Array, clock: float, lamps: Lamps, window: float) -> tuple[float, float]:
+        """Common delay (chips) of all lamps relative to their predicted phases, within ``window`` chips; correlation.
 
         Each code is correlated near the expected begin of its periods, on a grid of half samples.
         """
@@ -253,7 +253,7 @@ class Search:
         best = min(max(int(score.argmax()), 1), 2 * half - 1)
         before, there, behind = score[best - 1 : best + 2].tolist()
         fine = 0.25 * (behind - before) / max(2 * there - before - behind, 1e-9)
-        return float(0.5 * (best - half) + min(max(fine, -0.25), 0.25)) / spc
+        return float(0.5 * (best - half) + min(max(fine, -0.25), 0.25)) / spc, there
 
     def _fit_size(self, n: int) -> None:
         """Set the FFT length for blocks of ``n`` samples; another length clears the stored spectra."""

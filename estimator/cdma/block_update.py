@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Final
@@ -9,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma.acquisition import DOMINANCE, Job, Outcome, Search
+from estimator.cdma.acquisition import BIN, DOMINANCE, Job, Outcome, Search
 from estimator.cdma.acquisition_budget import Watch
 from estimator.cdma.air_interface import Profile
 from estimator.cdma.anomalies.residual_colour import Colour
@@ -40,6 +41,12 @@ STAMP_MARGIN_S: Final = 120e-6
 
 TOO_LONG_S: Final = 2.0 * STAMP_MARGIN_S
 """Excess of the time between a block's stamps over that of its samples from which it contains pauses, s."""
+
+MOST_CLOCKS: Final = 15
+"""Further sample clocks that are tried, `BIN` apart: up to 3 %."""
+
+BETTER_CLOCK: Final = 1.1
+"""Correlation with another sample clock, over that with the present one, from which it is taken."""
 
 PATIENCE: Final = 2
 """Noisy or stalled blocks in a row that are not learned from; a longer disturbance is permanent."""
@@ -132,7 +139,10 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
         decoder.background.learn(sampled.y, sampled.clean)
         decoder.colour.learn(sampled.clean)
         return BlockFlag.NONE, replace(sampled, y=sampled.clean)
-    flags, solved = _solve(decoder, sampled, _find_lag(decoder, sampled, excess))
+    if decoder.time_base.contradicted:
+        sampled = _try_clocks(decoder, sampled, excess)
+    lag, _ = _find_lag(decoder, sampled, excess, clocks.clock)
+    flags, solved = _solve(decoder, sampled, lag)
     found = int(flags)
     noisy, stalled = bool(found & _NOISY), bool(found & _STALLED)
     slots, codes = tracks.slots, tracks.code[tracks.slots]
@@ -196,8 +206,25 @@ def _add_twin(decoder: Decoder, solved: _Solved, flags: int, unsteady: float) ->
     return True
 
 
-def _find_lag(decoder: Decoder, sampled: Sampled, excess: float) -> float:
-    """Common delay of the block's time base, chips: the one with the best joint correlation of the strongest lamps."""
+def _try_clocks(decoder: Decoder, sampled: Sampled, excess: float) -> Sampled:
+    """Change to a sample clock nearer to the time stamps if the strongest lamps correlate better with it.
+
+    The lamps keep their phases in the middle of a block. Returns the block with the times of the clock chosen.
+    """
+    clocks, before = decoder.clocks, decoder.clocks.clock
+    trials = before + BIN * np.arange(min(math.ceil((clocks.stretch - before) / BIN), MOST_CLOCKS) + 1)
+    score = [_find_lag(decoder, sampled, excess, clock)[1] for clock in trials.tolist()]
+    best = int(np.argmax(score))
+    if score[best] < BETTER_CLOCK * score[0]:
+        return sampled
+    clocks.clock = float(trials[best])
+    clocks.doubt()
+    decoder.time_base.forget()
+    return replace(sampled, x=sampled.x * (1.0 + clocks.clock) / (1.0 + before))
+
+
+def _find_lag(decoder: Decoder, sampled: Sampled, excess: float, clock: float) -> tuple[float, float]:
+    """Common delay of the block's time base, chips, by the best joint correlation of the strongest lamps, and that."""
     tracks, clocks, profile = decoder.tracks, decoder.clocks, decoder.profile
     slots, predicted = tracks.slots, float(clocks.state[0])
     lit = slots[~tracks.faint(slots)]
@@ -205,7 +232,8 @@ def _find_lag(decoder: Decoder, sampled: Sampled, excess: float) -> float:
     window = (STAMP_MARGIN_S + 0.5 * excess) * profile.chip_rate + 3.0 * float(np.sqrt(clocks.cov[0, 0]))
     lamps = (tracks.code[chosen], tracks.phase[chosen] + predicted, np.maximum(tracks.amplitude[chosen], 0.0))
     window = min(window, 0.4 * profile.length)
-    return predicted + decoder.search.common_lag(sampled.clean, clocks.clock, lamps, window)
+    lag, correlation = decoder.search.common_lag(sampled.clean, clock, lamps, window)
+    return predicted + lag, correlation
 
 
 def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _Solved]:

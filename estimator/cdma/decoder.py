@@ -270,18 +270,20 @@ def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch
     code, amplitude, variance = tracks.code[links], tracks.amplitude[links], tracks.amplitude_var[links]
     twin = (code[:, None] == code).sum(axis=1) > 1
     faint, slow = tracks.faint(links), decoder.slow_lamps.slow(links)
+    relative_var = tracks.relative_var[links] + decoder.time_base.doubt**2
     return LightEpoch(
         t_begin=block.t_begin,
         t_end=block.t_end,
         ids=code,
         amplitude=amplitude * lsb,
-        variance=(variance + (tracks.relative_var[links] + decoder.time_base.doubt**2) * amplitude**2) * lsb**2,
+        variance=(variance + relative_var * amplitude**2) * lsb**2,
         flags=faint * _FAINT + twin * _TWIN + slow * _SLOW,
         lamps=tuple([tracks.frames[k] for k in links.tolist()]),
         block=flags,
         noise_a=decoder.noise * lsb,
         clock_ppm=decoder.clock_ppm,
         pwm=_pwm(decoder),
+        relative_var=relative_var,
     )
 
 

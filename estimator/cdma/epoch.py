@@ -88,6 +88,8 @@ class LightEpoch:
         lamps: data frame of each lamp, None until its first frame is complete.
         block: of :class:`BlockFlag`; without a usable block there are no links. noise_a: A per sample.
         clock_ppm: error of the sample clock, None until it is known. pwm: PWM-dimmed lamps, whose light is taken out.
+        relative_var: part of the variances that comes from errors in proportion to the amplitude, over its square; such
+            errors make no lamp doubtful. None: 0.
     """
 
     t_begin: float
@@ -101,6 +103,7 @@ class LightEpoch:
     noise_a: float
     clock_ppm: float | None
     pwm: tuple[PwmLight, ...] = ()
+    relative_var: Array | None = None
 
     @property
     def slow(self) -> frozenset[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Final
 
 from estimator.cdma.epoch import LightEpoch, LinkFlag
@@ -81,10 +82,11 @@ def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]
         epoch.variance.tolist(),
         epoch.flags.tolist(),
         epoch.lamps,
+        repeat(0.0, len(epoch.ids)) if epoch.relative_var is None else epoch.relative_var.tolist(),
         strict=True,
     )
     found = []
-    for code, amplitude, variance, flags, frame in rows:
+    for code, amplitude, variance, flags, frame, relative_var in rows:
         if not (NO_LIGHT_A < amplitude < math.inf and variance >= 0.0):
             found.append(Sight(code, 0.0, math.inf, FAINT))
             continue
@@ -100,7 +102,8 @@ def sights(lights: Lights, epoch: LightEpoch, x: float, y: float) -> list[Sight]
                 lights.catalogue.touch(sight.lamp.lamp_id, lights.course.t_mono)
         if sight.lamp is None:
             continue
-        if flags & FAINT_FLAG or amplitude <= lights.settings.faint * math.sqrt(variance):
+        noise_var = max(variance - relative_var * amplitude**2, 0.0)
+        if flags & FAINT_FLAG or amplitude <= lights.settings.faint * math.sqrt(noise_var):
             sight.state = FAINT
         else:
             sight.state = ACCEPTED if alone else TWIN

@@ -81,6 +81,16 @@ class TimeBase:
         """Whether there are pauses at unknown places."""
         return self._late >= UNKNOWN and not self._known
 
+    @property
+    def contradicted(self) -> bool:
+        """Whether time stamps have contradicted the sample clock long enough to look for another one."""
+        return self._late > 0 and self._late % LATE == 0
+
+    def forget(self) -> None:
+        """Forget the pattern: it belongs to another sample clock."""
+        self._shift, self._known = np.zeros(len(self._shift)), False
+        self._seen, self._pauses = [], []
+
     def moved(self, x: Array) -> Array:
         """Sample times (N,) in chips with the pattern of pauses; unchanged for blocks of another length."""
         return x + self._shift if self._known and len(self._shift) == len(x) else x

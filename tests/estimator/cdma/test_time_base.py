@@ -25,10 +25,12 @@ def every(samples: int, seconds: float, size: int = 1111) -> tuple[tuple[int, fl
         (((555, 30e-6),), 12),
         (((200, 12e-6), (700, 20e-6)), 12),
         (every(256, 10e-6), 11),
-        (every(64, 10e-6), 9),
-        (every(30, 10e-6), 9),
-        (every(22, 5e-6), 0),
-        (every(64, 50e-6), 0),
+        (every(64, 10e-6), 11),
+        (every(30, 10e-6), 11),
+        (every(22, 5e-6), 11),
+        (every(128, 30e-6), 11),
+        (every(256, 50e-6), 11),
+        (every(64, 50e-6), 11),
     ],
 )
 def test_flagged_and_honest(stalls: tuple[tuple[int, float], ...], lamps: int) -> None:
