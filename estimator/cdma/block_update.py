@@ -177,16 +177,17 @@ def _add_twin(decoder: Decoder, solved: _Solved, flags: int, unsteady: float) ->
 
     Candidates are dropped then: they may be cross-correlations of it.
     """
-    tracks, slots = decoder.tracks, decoder.tracks.slots
-    trying = tracks.life[slots] == _TENTATIVE
+    tracks = decoder.tracks
     decoder.untested += 1
     if decoder.untested <= RESTED or flags & _MENDED:
         return False
     only = None
-    if not (flags & _UNUSUAL or trying.any()):
+    if not (flags & _UNUSUAL or (tracks.life == _TENTATIVE).any()):
         if decoder.untested < RESTED + UNTESTED or not decoder.colour.coloured:
             return False
         decoder.rank = only = (decoder.rank + 1) % LEADING
+    slots = tracks.slots
+    trying = tracks.life[slots] == _TENTATIVE
     twin = find_twin(solved.block, solved.prior, solved.fit, decoder.shape, decoder.profile, only)
     if twin is None:
         decoder.untested = RESTED
@@ -228,8 +229,10 @@ def _find_lag(decoder: Decoder, sampled: Sampled, excess: float, clock: float) -
     tracks, clocks, profile = decoder.tracks, decoder.clocks, decoder.profile
     slots, predicted = tracks.slots, float(clocks.state[0])
     lit = slots[~tracks.faint(slots)]
-    chosen = lit[np.argsort(-tracks.amplitude[lit])[:LEADERS]] if len(lit) else slots  # none received: all slots
     window = (STAMP_MARGIN_S + 0.5 * excess) * profile.chip_rate + 3.0 * float(np.sqrt(clocks.cov[0, 0]))
+    if tracks.shared:
+        lit, window = tracks.unambiguous(lit, window)
+    chosen = lit[np.argsort(-tracks.amplitude[lit])[:LEADERS]] if len(lit) else slots  # none received: all slots
     lamps = (tracks.code[chosen], tracks.phase[chosen] + predicted, np.maximum(tracks.amplitude[chosen], 0.0))
     window = min(window, 0.4 * profile.length)
     lag, correlation = decoder.search.common_lag(sampled.clean, clock, lamps, window)

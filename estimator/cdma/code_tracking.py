@@ -256,6 +256,22 @@ class Tracks:
             for other in others[(apart < MERGED) & (self.life[others] != _FREE)].tolist():
                 self.drop(slot if self.amplitude[slot] < self.amplitude[other] else other)
 
+    def unambiguous(self, slots: Index, window: float) -> tuple[Index, float]:
+        """Lamps that determine a common delay, and the reach of its search, chips: twins shifted by their distance look
+        alike.
+
+        Lamps without a twin do if one is evident; else the reach is half the distance of the nearest twins.
+        """
+        twin = (self.code[slots, None] == self.code[slots]).sum(axis=1) > 1
+        alone = slots[~twin]
+        if (self.amplitude[alone] > EVIDENT * np.sqrt(self.amplitude_var[alone])).any():
+            return alone, window
+        apart = np.abs(
+            (self.phase[slots, None] - self.phase[slots] + 0.5 * self.length) % self.length - 0.5 * self.length
+        )
+        other = (self.code[slots, None] == self.code[slots]) & ~np.eye(len(slots), dtype=bool)
+        return slots, min(window, 0.5 * float(apart[other].min(initial=np.inf)))
+
     def _place(self, k: int, phase: float, t: float) -> None:
         """Set a slot to the phase of a search at time ``t``."""
         chips = (self.t - t) * self._chip_rate

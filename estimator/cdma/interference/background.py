@@ -75,11 +75,11 @@ class Background:
 
     def learn(self, light: Array, residual: Array) -> None:
         """Track the PWM lamps, for the next block; ``light``: (N,) a block without coded lamps; its ``residual``."""
-        if self.pwm.due(residual):
+        if self.pwm.due(float(np.vdot(residual, residual))):
             self.pwm.learn(light, residual, self.mains.rows(light))
 
     def learn_beyond(self, fit: Fit) -> None:
         """Track the PWM lamps by what the coded lamps of a fit leave."""
-        if self.pwm.due(fit.residual):
+        if self.pwm.due(fit.noise_var * len(fit.residual)):
             light = fit.residual + fit.nuisance
             self.pwm.learn(light, fit.residual, self.mains.rows(light))

@@ -162,12 +162,11 @@ class PwmLamps:
         if len(self._tracks) < MOST:
             self._look_for(light, residual, mains)
 
-    def due(self, residual: Array) -> bool:
-        """Whether to learn from a block with this residual (N,): always with a lamp, else when to search for one."""
+    def due(self, energy: float) -> bool:
+        """Whether to learn from a block with this energy of its residual: always with a lamp, else at times."""
         if self._tracks:
             return True
         self._unlooked += 1
-        energy = float(np.vdot(residual, residual))
         if energy > LOUDER * self._searched:
             self._interval = LOOK_EVERY
         if self._unlooked < self._interval:
