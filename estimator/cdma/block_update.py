@@ -115,12 +115,14 @@ class Decoder:
 
 @dataclass(eq=False)
 class _Solved:
-    """A block and its fit, with the prior and the delay (chips, predicted part included) that the fit started from."""
+    """A block and its fit, with the slots, the prior and the delay (chips, predicted part included) it started from."""
 
     block: Sampled
+    slots: Index
     prior: Prior
     lag: float
     fit: Fit
+    newcomers: bool
 
 
 def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[BlockFlag, Sampled]:
@@ -145,7 +147,6 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     flags, solved = _solve(decoder, sampled, lag)
     found = int(flags)
     noisy, stalled = bool(found & _NOISY), bool(found & _STALLED)
-    slots, codes = tracks.slots, tracks.code[tracks.slots]
     decoder.stalled = decoder.stalled + 1 if stalled else 0
     unsteady = unsteadiness(solved.block.y, solved.fit)
     if unsteady:
@@ -155,20 +156,20 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     if _add_twin(decoder, solved, found, unsteady):
         return flags, replace(solved.block, y=np.zeros_like(solved.fit.residual))
     if noisy and decoder.odd < PATIENCE:
-        _weigh(decoder, solved.fit, unsteady)
+        _weigh(decoder, solved, unsteady)
     elif not stalled or decoder.stalled > PATIENCE:
-        _weigh(decoder, solved.fit, unsteady)
+        _weigh(decoder, solved, unsteady)
         _read(decoder, solved)
         if solved.fit.clearest > CLEAR:  # otherwise no lamp is received, and the delay found is chance
             clocks.update(solved.lag + solved.fit.lag - float(clocks.state[0]), excess, solved.fit)
-            tracks.learn_phases(tracks.slots, solved.fit)
+            tracks.learn_phases(solved.slots, solved.fit)
         _live_and_die(decoder, solved, suspicious=noisy)
     if not found & (_STALLED | _MENDED):
         decoder.background.learn_beyond(solved.fit)
         decoder.colour.learn(solved.fit.residual)
     lasting = not noisy or decoder.odd >= PATIENCE
     if lasting and not found & ~(_CLIPPED | _NOISY) and len(tracks.confirmed):
-        decoder.slow_lamps.learn(solved.block, solved.prior, solved.fit, decoder.shape, slots, codes)
+        decoder.slow_lamps.learn(solved.block, solved.prior, solved.fit, decoder.shape, tracks.code, solved.slots)
     return flags, replace(solved.block, y=solved.fit.residual)
 
 
@@ -182,11 +183,11 @@ def _add_twin(decoder: Decoder, solved: _Solved, flags: int, unsteady: float) ->
     if decoder.untested <= RESTED or flags & _MENDED:
         return False
     only = None
-    if not (flags & _UNUSUAL or (tracks.life == _TENTATIVE).any()):
+    if not (flags & _UNUSUAL or solved.newcomers):
         if decoder.untested < RESTED + UNTESTED or not decoder.colour.coloured:
             return False
         decoder.rank = only = (decoder.rank + 1) % LEADING
-    slots = tracks.slots
+    slots = solved.slots
     trying = tracks.life[slots] == _TENTATIVE
     twin = find_twin(solved.block, solved.prior, solved.fit, decoder.shape, decoder.profile, only)
     if twin is None:
@@ -194,7 +195,7 @@ def _add_twin(decoder: Decoder, solved: _Solved, flags: int, unsteady: float) ->
         return False
     decoder.untested = 0
     first = int(slots[twin.lamp])
-    _weigh(decoder, solved.fit, unsteady)
+    _weigh(decoder, solved, unsteady)
     for slot in slots[trying & (slots != first) & (tracks.code[slots] != tracks.code[first])].tolist():
         tracks.drop(slot)
     shift = float(solved.fit.phase[twin.lamp]) + solved.lag + solved.fit.lag - float(decoder.clocks.state[0])
@@ -261,13 +262,14 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
         prior = prior_at(0.0)
         fit = joint_fit(sampled, prior, tables)
         verdict = judge(sampled, fit, decoder.usual_noise)
-    solved = _Solved(sampled, prior, lag, fit)
-    _listen(decoder, fit)
-    if len(tracks.confirmed):
+    confirmed = len(tracks.confirmed)
+    newcomers = confirmed < len(slots)
+    solved = _Solved(sampled, slots, prior, lag, fit, newcomers)
+    _listen(decoder, fit, confirmed > 0)
+    if confirmed:
         decoder.time_base.learn(fit.mixed_slope, fit.residual, fit.noise_var)
-    if verdict.good or not len(tracks.confirmed):
+    if verdict.good or not confirmed:
         return BlockFlag.NONE, solved
-    newcomers = bool(np.any(tracks.life[slots] == Life.TENTATIVE))
     if newcomers and not (verdict.bent or verdict.smooth):
         return BlockFlag.NOISY, solved  # the residual comes from the candidates
     mended = mend(sampled, fit, prior_at, tables, decoder.background, decoder.usual_noise)
@@ -275,38 +277,38 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
         return BlockFlag.NONE, solved
     if isinstance(mended, bool):
         return BlockFlag.STALLED if mended else BlockFlag.NOISY, solved
-    if mended.block.steps and (len(tracks.confirmed) >= LEADERS or not newcomers):
+    if mended.block.steps and (confirmed >= LEADERS or not newcomers):
         pause = mended.block.x - sampled.x
         decoder.time_base.on_pause(mended.block.steps[0], float(pause[-1] + mended.fit.steps[0]))
-    return BlockFlag.MENDED, _Solved(mended.block, mended.prior, lag + mended.lag, mended.fit)
+    return BlockFlag.MENDED, _Solved(mended.block, slots, mended.prior, lag + mended.lag, mended.fit, newcomers)
 
 
-def _listen(decoder: Decoder, fit: Fit) -> None:
-    """Track the usual noise: a fall quickly, a rise slowly, so that single blocks do not count."""
+def _listen(decoder: Decoder, fit: Fit, confirmed: bool) -> None:
+    """Track the usual noise beside confirmed lamps: a fall quickly, a rise slowly, so that single blocks do not count."""
     noise = float(np.sqrt(fit.noise_var))
     decoder.noise = noise
-    if len(decoder.tracks.confirmed):
+    if confirmed:
         usual = decoder.usual_noise or noise
         change = min(noise, 1.5 * usual) - usual
         decoder.usual_noise = usual + (0.1 if change > 0.0 else 0.5) * change
 
 
-def _weigh(decoder: Decoder, fit: Fit, unsteady: float) -> None:
+def _weigh(decoder: Decoder, solved: _Solved, unsteady: float) -> None:
     """Store the amplitudes. Excess residual adds to their variance: it may be a lamp, and codes are not orthogonal.
 
     ``unsteady``: relative change of all amplitudes within the block, rms; it adds likewise.
     """
-    tracks, slots = decoder.tracks, decoder.tracks.slots
+    slots, fit = solved.slots, solved.fit
     excess = max(fit.noise_var - (QUIET * decoder.usual_noise) ** 2, 0.0) if decoder.usual_noise else 0.0
     crossed = CROSSED**2 * excess / pulse_energy(decoder.profile)
     relative_var = unsteady**2 + decoder.slow_lamps.spread(slots, decoder.shape)
-    tracks.weigh(slots, fit.amplitude, fit.amplitude_var + crossed, relative_var)
+    decoder.tracks.weigh(slots, fit.amplitude, fit.amplitude_var + crossed, relative_var)
     decoder.noise = float(np.sqrt(fit.noise_var))
 
 
 def _read(decoder: Decoder, solved: _Solved) -> None:
     """Accumulate the data bits, and store data frames that are complete."""
-    tracks, fit, slots = decoder.tracks, solved.fit, decoder.tracks.slots
+    tracks, fit, slots = decoder.tracks, solved.fit, solved.slots
     first = tracks.first_period(slots, solved.lag, -float(solved.block.x[0]))
     tracks.rings.add(slots, first, fit.soft, fit.soft_var)
     for slot, frame in tracks.rings.frames(slots, tracks.code[slots], first):
@@ -319,7 +321,7 @@ def _live_and_die(decoder: Decoder, solved: _Solved, suspicious: bool) -> None:
     Candidates are tested for side lobes; in suspicious blocks so are all lamps. A candidate must be stronger than the
     cross-correlation of a lamp that would explain the whole residual.
     """
-    tracks, slots = decoder.tracks, decoder.tracks.slots
+    tracks, slots = decoder.tracks, solved.slots
     doubtful = suspicious & (solved.fit.amplitude > CLEAR * np.sqrt(solved.fit.amplitude_var))  # only if received
     for k in np.flatnonzero((tracks.life[slots] == Life.TENTATIVE) | doubtful):
         beside = side_lobe(solved.block, solved.prior, solved.fit, int(k), decoder.shape.tables)

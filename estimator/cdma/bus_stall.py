@@ -183,9 +183,7 @@ def mend(
     return evident
 
 
-def _without_burst(
-    block: Sampled, fit: Fit, prior: Prior, tables: Array, background: Background
-) -> Mended | None:
+def _without_burst(block: Sampled, fit: Fit, prior: Prior, tables: Array, background: Background) -> Mended | None:
     """The block with its loudest samples masked; None if the residual is not concentrated there."""
     power = np.cumsum(np.concatenate(((0.0,), fit.residual**2)))
     within = power[2 * MARGIN :] - power[: -2 * MARGIN]

@@ -277,7 +277,7 @@ def _epoch(decoder: Decoder, block: SampleBlock, flags: BlockFlag) -> LightEpoch
         ids=code,
         amplitude=amplitude * lsb,
         variance=(variance + relative_var * amplitude**2) * lsb**2,
-        flags=faint * _FAINT + twin * _TWIN + slow * _SLOW,
+        flags=faint * _FAINT + twin * _TWIN + slow * _SLOW if slow.any() else faint * _FAINT + twin * _TWIN,
         lamps=tuple([tracks.frames[k] for k in links.tolist()]),
         block=flags,
         noise_a=decoder.noise * lsb,

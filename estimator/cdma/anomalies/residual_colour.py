@@ -1,6 +1,7 @@
-"""Colour of the residual: noise of a converter is white, light that is not explained is not.
+"""Colour of the residual: whether it contains chips.
 
-The codes, and whatever passes the low-pass, correlate from sample to sample.
+Both halves of a chip cancel. So samples half a chip apart are alike less than those nearer and farther; noise of a
+converter correlates nowhere, slow light everywhere.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ import numpy as np
 
 from estimator.numerics.arrays import Array
 
-LAGS: Final = (1, 2, 3)
-"""Samples: up to a chip, whose halves have opposite signs."""
+LAGS: Final = ((1, 0.5), (2, -0.5), (3, -0.5), (4, 0.5))
+"""Samples up to a chip, and the sign with which their correlation counts; the squares add to 1."""
 
 EVERY: Final = 4
 """Blocks between two looks."""
@@ -21,16 +22,16 @@ MEMORY: Final = 0.875
 """Weight of the earlier looks."""
 
 SIGMAS: Final = 3.0
-"""Correlation from which a residual is coloured, in sigmas of white noise."""
+"""Sigmas of white noise from which a residual is coloured."""
 
 
 class Colour:
-    """Averaged autocorrelation of the residuals of a decoder."""
+    """Averaged contrast of the autocorrelation of a decoder's residuals."""
 
     def __init__(self) -> None:
         """White."""
         self._wait = EVERY
-        self._mean = [0.0] * len(LAGS)
+        self._mean = 0.0
         self.coloured = False
 
     def learn(self, residual: Array) -> None:
@@ -40,7 +41,6 @@ class Colour:
             return
         self._wait = EVERY
         energy = max(float(np.vdot(residual, residual)), 1e-12)
-        seen = [float(np.vdot(residual[lag:], residual[:-lag])) / energy for lag in LAGS]
-        self._mean = [MEMORY * mean + (1.0 - MEMORY) * now for mean, now in zip(self._mean, seen, strict=True)]
-        variance = (1.0 - MEMORY) / (1.0 + MEMORY) / len(residual)
-        self.coloured = max(mean * mean for mean in self._mean) > SIGMAS**2 * variance
+        seen = sum(sign * float(np.vdot(residual[lag:], residual[:-lag])) for lag, sign in LAGS) / energy
+        self._mean = MEMORY * self._mean + (1.0 - MEMORY) * seen
+        self.coloured = self._mean > SIGMAS * np.sqrt((1.0 - MEMORY) / (1.0 + MEMORY) / len(residual))

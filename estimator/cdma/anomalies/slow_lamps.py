@@ -80,18 +80,20 @@ class SlowLamps:
         self._wait, self._updates = SOON, 0
         self._joint, self._astray = False, True
 
-    def learn(self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, slots: Index, codes: Index) -> None:
-        """Learn from one more block, every few blocks; the corner, too, once there are slow lamps."""
+    def learn(self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, codes: Index, slots: Index) -> None:
+        """Learn from one more block, every few blocks; the corner, too, once there are slow lamps.
+
+        ``codes``: of all slots; ``slots``: of the lamps in the fit.
+        """
         if not self._joint:
             shape.learn(block, prior, fit)
         self._wait -= 1
         suspect = not self._joint and abs(shape.corner - 1.0) > SUSPECT
-        if (self._wait and not suspect) or (self._joint and shape.behind(slots)):
-            self._wait = max(self._wait, 1)
+        if (self._wait > 0 and not suspect) or (self._joint and shape.behind(slots)):
             return
         self._updates += 1
-        self._start(slots[self._code[slots] != codes], shape)
-        self._code[slots] = codes
+        self._start(slots[self._code[slots] != codes[slots]], shape)
+        self._code[slots] = codes[slots]
         self._wait = SOON if self._updates < SETTLED else LATER if self._joint else SELDOM
         if self._joint:
             self._estimate(block, prior, fit, shape, slots)

@@ -23,7 +23,7 @@ EVIDENT: Final = 3.0
 
 SUSPECT: Final = 2.0
 """The same, below which there is no sign of a pattern, and one block in `EVEN_EVERY` is averaged."""
-EVEN_EVERY: Final = 8
+EVEN_EVERY: Final = 16
 
 MEDIAN: Final = 1.57
 """Variance of a median over that of a mean."""

@@ -40,8 +40,11 @@ class Background:
         """
         self._overdriven = overdriven
         mains = self.mains.rows(y)
+        masked = mask.min() == 0.0
+        if not (masked or len(self.pwm)):
+            return mains
         times = np.arange(len(y), dtype=np.float64)
-        if mask.min() == 0.0:
+        if masked:
             mains = self._slow(times, mask)
         if len(self.pwm):
             self.pwm.find_phases(y - mixed(inner(mains, y), mains), mains)
