@@ -284,7 +284,7 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
 
 
 def _listen(decoder: Decoder, fit: Fit, confirmed: bool) -> None:
-    """Track the usual noise beside confirmed lamps: a fall quickly, a rise slowly, so that single blocks do not count."""
+    """Track the usual noise beside confirmed lamps: a fall quickly, a rise slowly: single blocks do not count."""
     noise = float(np.sqrt(fit.noise_var))
     decoder.noise = noise
     if confirmed:

@@ -257,10 +257,10 @@ class Tracks:
                 self.drop(slot if self.amplitude[slot] < self.amplitude[other] else other)
 
     def unambiguous(self, slots: Index, window: float) -> tuple[Index, float]:
-        """Lamps that determine a common delay, and the reach of its search, chips: twins shifted by their distance look
-        alike.
+        """Lamps that determine a common delay, and the reach of its search, chips.
 
-        Lamps without a twin do if one is evident; else the reach is half the distance of the nearest twins.
+        Twins shifted by their distance look alike. So lamps without a twin determine it if one is evident; else the
+        reach is half the distance of the nearest twins.
         """
         twin = (self.code[slots, None] == self.code[slots]).sum(axis=1) > 1
         alone = slots[~twin]

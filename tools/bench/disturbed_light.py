@@ -1,8 +1,8 @@
 """The light decoder of profile A beside PWM-dimmed lamps, and with two lamps of one code close in phase.
 
 ``python -m tools.bench.disturbed_light pwm`` (2 minutes) prints the lamps found beside each dimmed lamp.
-``python -m tools.bench.disturbed_light twins --blocks 2000`` counts blocks with codes that no lamp has, for each distance
-and ratio (a quarter of an hour).
+``python -m tools.bench.disturbed_light twins`` (a quarter of an hour) counts blocks with codes that no lamp has, for
+each distance and ratio.
 """
 
 from __future__ import annotations

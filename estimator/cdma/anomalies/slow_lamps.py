@@ -250,7 +250,7 @@ class SlowLamps:
 
 def _solved(precision: Array, pull: Array) -> tuple[Array, Array]:
     """Covariance and step of a Kalman update in information form."""
-    covariance = np.linalg.inv(precision)
+    covariance: Array = np.linalg.inv(precision)
     return covariance, (covariance * pull).sum(axis=1)
 
 
