@@ -42,6 +42,9 @@ SUSPECT: Final = 0.04
 CORNER, SQUARE = 0.05, (20e-6) ** 2
 """Sigmas of the corner and of a squared rise time, s^2, before any measurement."""
 
+SHARED: Final = 0.05**2
+"""Variance of the squared rise time that lamps share, in squares of `SQUARE`: the low-pass has the larger tolerance."""
+
 PINNED: Final = 1e6
 """Precision of a corner that is at the end of its tolerance."""
 
@@ -50,6 +53,9 @@ CORNER_WALK, SQUARE_WALK = 3e-4, 2e-12
 
 SHARED_S: Final = (10e-6, 15e-6, 20e-6, 30e-6, 40e-6, 50e-6)
 """Rise times, s, that are tried for all lamps together at the start of the joint estimation."""
+
+CLEARER: Final = 0.5
+"""Energy that a shared rise time leaves, over that which the corner alone leaves, below which it is taken."""
 
 LEADERS: Final = 4
 """Lamps, the strongest first, that decide about it."""
@@ -75,7 +81,7 @@ class SlowLamps:
         self._code = np.full(slots, -1)
         self._sums = np.zeros((2, slots))  # excess of the square by weight, weight
         self._own, self._common = np.zeros(slots), 0.0
-        self._covariance = np.eye(slots + 2)
+        self._covariance = np.diag([1.0] * slots + [SHARED, 1.0])
         self._slow = np.zeros(slots, np.bool_)
         self._wait, self._updates = SOON, 0
         self._joint, self._astray = False, True
@@ -102,16 +108,17 @@ class SlowLamps:
 
     def _estimate_jointly(self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, slots: Index) -> None:
         """From now on estimate the corner with the rise times, beginning with a rise time that all lamps share."""
-        shared = [self._left_by(rise_s, block, prior, fit, shape) for rise_s in (self._usual_s, *SHARED_S)]
+        by_corner = self._left_by(self._usual_s, shape.corner, block, prior, fit, shape)
+        shared = [self._left_by(rise_s, 1.0, block, prior, fit, shape) for rise_s in SHARED_S]
         best = int(np.argmin(shared))
         self._joint, self._wait = True, 1
         shape.set_corner(1.0)
-        if best:
-            self._common = SHARED_S[best - 1] ** 2 - self._usual_s**2
-            self._slow[slots], shape.rise_s[slots] = True, SHARED_S[best - 1]
+        if shared[best] < CLEARER * by_corner:
+            self._common = SHARED_S[best] ** 2 - self._usual_s**2
+            self._slow[slots], shape.rise_s[slots] = True, SHARED_S[best]
 
-    def _left_by(self, rise_s: float, block: Sampled, prior: Prior, fit: Fit, shape: Shape) -> float:
-        """Energy of the strongest lamps' light that is left if all of them rise with this time constant."""
+    def _left_by(self, rise_s: float, corner: float, block: Sampled, prior: Prior, fit: Fit, shape: Shape) -> float:
+        """Energy of the strongest lamps' light that is left if all rise with this time constant, at this corner."""
         some = np.argsort(-fit.amplitude)[:LEADERS]
         lamps = np.ascontiguousarray(prior.lamps(fit.phase + fit.lag)[:, some])
         lamps[1] *= 1.0 + fit.clock
@@ -120,7 +127,7 @@ class SlowLamps:
         columns(chips, lamps, block.samples, signs, shape.tables, waves)
         light = block.project(fit.residual + mixed(fit.amplitude[some], waves[0]))
         lamps[0] += (rise_s - self._usual_s) * self._profile.chip_rate
-        columns(chips, lamps[:2].copy(), block.samples, signs, slow_table(self._profile, rise_s)[None], waves)
+        columns(chips, lamps[:2].copy(), block.samples, signs, slow_table(self._profile, rise_s, corner)[None], waves)
         rows = orthonormal(np.array([block.project(row) for row in waves.reshape(-1, len(block.x))]))[0]
         weights = inner(rows, light)
         return float(np.vdot(light, light) - np.vdot(weights, weights))
@@ -172,7 +179,7 @@ class SlowLamps:
         rows = np.insert(rows, len(slots), rows[:-1].sum(axis=0), axis=0)
         seen = np.ix_(*(np.append(slots, (-2, -1)),) * 2)
         if self._astray:
-            self._covariance[seen] = np.eye(len(rows))
+            self._covariance[seen] = np.diag([1.0] * len(slots) + [SHARED, 1.0])
         precision = np.linalg.inv(self._covariance[seen]) + np.einsum("ik,jk->ij", rows, rows) / fit.noise_var
         pull = inner(rows, left) / fit.noise_var
         covariance, step = _solved(precision, pull)
