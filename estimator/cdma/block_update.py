@@ -17,7 +17,6 @@ from estimator.cdma.anomalies.residual_colour import Colour
 from estimator.cdma.anomalies.saturation import unsteadiness
 from estimator.cdma.anomalies.slow_lamps import SlowLamps
 from estimator.cdma.anomalies.time_base import TimeBase
-from estimator.cdma.anomalies.twin import LEADERS as LEADING
 from estimator.cdma.anomalies.twin import find_twin
 from estimator.cdma.bus_stall import judge, mend
 from estimator.cdma.chip_pulse import Shape, pulse_energy
@@ -64,9 +63,10 @@ SPURIOUS: Final = 0.01
 RESTED: Final = 3
 """Blocks after a twin was found until the next test: the twin is judged, and all lamps are tracked meanwhile."""
 
-UNTESTED: Final = 32
-"""Blocks without a candidate until one of the strongest lamps, in turn, is tested for a twin, if the residual is not
-white."""
+SOON, UNTESTED = 4, 32
+"""Blocks without a candidate, after that, until the next test if the residual contains chips; the number doubles up to
+the second one while no twin is found.
+"""
 
 
 ASTRAY: Final = 0.3
@@ -102,7 +102,7 @@ class Decoder:
         self.time_base = TimeBase()
         self.slow_lamps = SlowLamps(profile, CAPACITY)
         self.colour = Colour()
-        self.untested, self.rank = RESTED, 0
+        self.untested, self.interval = RESTED, SOON
         self.odd = 0
         self.noise = 0.0
         self.usual_noise = 0.0
@@ -182,18 +182,17 @@ def _add_twin(decoder: Decoder, solved: _Solved, flags: int, unsteady: float) ->
     decoder.untested += 1
     if decoder.untested <= RESTED or flags & _MENDED:
         return False
-    only = None
     if not (flags & _UNUSUAL or solved.newcomers):
-        if decoder.untested < RESTED + UNTESTED or not decoder.colour.coloured:
+        if decoder.untested < RESTED + decoder.interval or not decoder.colour.coloured:
             return False
-        decoder.rank = only = (decoder.rank + 1) % LEADING
+        decoder.interval = min(2 * decoder.interval, UNTESTED)
     slots = solved.slots
     trying = tracks.life[slots] == _TENTATIVE
-    twin = find_twin(solved.block, solved.prior, solved.fit, decoder.shape, decoder.profile, only)
+    twin = find_twin(solved.block, solved.prior, solved.fit, decoder.shape, decoder.profile)
     if twin is None:
         decoder.untested = RESTED
         return False
-    decoder.untested = 0
+    decoder.untested, decoder.interval = 0, SOON
     first = int(slots[twin.lamp])
     _weigh(decoder, solved, unsteady)
     for slot in slots[trying & (slots != first) & (tracks.code[slots] != tracks.code[first])].tolist():

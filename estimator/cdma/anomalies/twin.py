@@ -71,18 +71,13 @@ def slower(profile: Profile) -> list[Array]:
     return [slow_table(profile, rise_s)[None] for rise_s in RISES_S]
 
 
-def find_twin(
-    block: Sampled, prior: Prior, fit: Fit, shape: Shape, profile: Profile, only: int | None = None
-) -> Twin | None:
-    """The lamp that explains the residual better as two lamps than as one, slow or not; None if there is none.
-
-    ``only``: rank, by strength, of the only lamp to be tested; None: all leaders are.
-    """
+def find_twin(block: Sampled, prior: Prior, fit: Fit, shape: Shape, profile: Profile) -> Twin | None:
+    """The lamp that explains the residual better as two lamps than as one, slow or not; None if there is none."""
     energy = float(np.vdot(fit.residual, fit.residual))
     shares = {
         lamp: _suspicion(block, prior, fit, lamp, shape.tables)
-        for rank, lamp in enumerate(np.argsort(-fit.amplitude)[:LEADERS].tolist())
-        if fit.amplitude[lamp] > 0.0 and only in (None, rank)
+        for lamp in np.argsort(-fit.amplitude)[:LEADERS].tolist()
+        if fit.amplitude[lamp] > 0.0
     }
     lamp = max(shares, key=lambda k: shares[k], default=-1)
     if lamp < 0 or shares[lamp] < SUSPECT * energy:

@@ -29,12 +29,16 @@ BETTER: Final = 1.25
 """Factor in explained energy by which a lower fundamental must exceed a higher one."""
 
 
-def fundamental(residual: Array) -> float | None:
-    """Fundamental (cycles per sample, below 0.5) of the strongest comb of lines in a block; None if there is none."""
+def fundamental(residual: Array, usual: int = 0) -> float | None:
+    """Fundamental (cycles per sample, below 0.5) of the strongest comb of lines in a block; None if there is none.
+
+    ``usual``: samples of a usual block; longer ones do not resolve more from the mains.
+    """
     n = len(residual)
+    lowest = LOWEST_CELLS / (min(n, usual) or n)
     size = 1 << (PADDING * n - 1).bit_length()
     power = np.abs(np.fft.rfft(residual, size)) ** 2 * (2.0 / (n * max(float(np.vdot(residual, residual)), 1e-30)))
-    first = int(LOWEST_CELLS * size / n)
+    first = int(lowest * size)
     peak = int(np.argmax(power[first:-1])) + first
     if power[peak] < 0.3 * SHARE:
         return None
@@ -43,7 +47,7 @@ def fundamental(residual: Array) -> float | None:
     best, found = 0.0, None
     for order in range(1, LARGEST_ORDER + 1):
         frequency = line / order
-        if frequency * n < LOWEST_CELLS:
+        if frequency < lowest:
             break
         multiples = np.arange(1, min(MOST_HARMONICS, int(1.5 / frequency)) + 1, dtype=np.int64)
         excess = _comb_share(power, frequency, multiples, n, size) - 2.0 * len(multiples) / n

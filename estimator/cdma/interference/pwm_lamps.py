@@ -99,7 +99,7 @@ class PwmLamps:
     def __init__(self, profile: Profile) -> None:
         """No lamp yet."""
         self._chain = Chain(profile)
-        self._rate = profile.sample_rate
+        self._rate, self._usual = profile.sample_rate, round(profile.epoch_s * profile.sample_rate)
         self._tracks: list[_Track] = []
         self._unlooked = self._interval = LOOK_EVERY
         self._searched = 0.0
@@ -266,7 +266,7 @@ class PwmLamps:
 
     def _look_for(self, light: Array, residual: Array, mains: Array) -> None:
         """Add the strongest comb of the residual to the lamps."""
-        frequency = fundamental(residual)
+        frequency = fundamental(residual, self._usual)
         cell = SAME_CELLS / len(residual)
         if frequency is None or any(abs(frequency - track.pulses.frequency) < cell for track in self._tracks):
             return
