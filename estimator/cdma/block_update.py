@@ -167,7 +167,7 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     if not found & (_STALLED | _MENDED):
         decoder.background.learn_beyond(solved.fit)
         decoder.colour.learn(solved.fit.residual)
-    lasting = not noisy or decoder.odd >= PATIENCE
+    lasting = (not noisy or decoder.odd >= PATIENCE) and not (tracks.shared and solved.newcomers)  # a twin on trial
     if lasting and not found & ~(_CLIPPED | _NOISY) and len(tracks.confirmed):
         decoder.slow_lamps.learn(solved.block, solved.prior, solved.fit, decoder.shape, tracks.code, solved.slots)
     return flags, replace(solved.block, y=solved.fit.residual)

@@ -257,7 +257,7 @@ class SlowLamps:
 
 def _solved(precision: Array, pull: Array) -> tuple[Array, Array]:
     """Covariance and step of a Kalman update in information form."""
-    covariance: Array = np.linalg.inv(precision)
+    covariance = np.asarray(np.linalg.inv(precision), np.float64)
     return covariance, (covariance * pull).sum(axis=1)
 
 
