@@ -259,11 +259,11 @@ class Tracks:
     def unambiguous(self, slots: Index, window: float) -> tuple[Index, float]:
         """Lamps that determine a common delay, and the reach of its search, chips.
 
-        Twins shifted by their distance look alike. So lamps without a twin determine it if one is evident; else the
-        reach is half the distance of the nearest twins.
+        Twins shifted by their distance look alike. So confirmed lamps without a twin determine it if one is evident;
+        else the reach is half the distance of the nearest twins. A candidate may be no lamp.
         """
         twin = (self.code[slots, None] == self.code[slots]).sum(axis=1) > 1
-        alone = slots[~twin]
+        alone = slots[~twin & (self.life[slots] == _CONFIRMED)]
         if (self.amplitude[alone] > EVIDENT * np.sqrt(self.amplitude_var[alone])).any():
             return alone, window
         apart = np.abs(
