@@ -47,6 +47,12 @@ def test_twins_are_separated(apart: float, ratio: float) -> None:
     look(twins(11, apart, ratio), 40)
 
 
+@pytest.mark.parametrize(("seed", "apart", "ratio"), [(1, 1.5, 0.3), (6, 1.2, 0.3), (7, 1.5, 1.0)])
+def test_candidates_do_not_shift_twins_by_their_distance(seed: int, apart: float, ratio: float) -> None:
+    """Beside twins that are just found, most candidates are their cross-correlations."""
+    look(twins(seed, apart, ratio), 15)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", RATIOS)
 @pytest.mark.parametrize("apart", np.round(np.linspace(0.3, 1.5, 12), 2).tolist())
