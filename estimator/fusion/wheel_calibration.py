@@ -57,10 +57,10 @@ It is twice the 99.99 % quantile of chi-square with 5 degrees of freedom: slip a
 """
 MOST_LEARNED: Final = 16.3
 """Largest squared Mahalanobis distance (99.9 % of chi-square with 3 degrees) of which the noise is learned."""
-SURPRISE: Final = 25.0
-"""Squared Mahalanobis distance of a heading correction that no wheel explains; as in `kidnap_detection`."""
-STAMP_S: Final = 0.1
-"""Sigma (s) of the time offset between lidar and wheels, before it is known."""
+SURPRISE: Final = 51.4
+"""Squared Mahalanobis distance of a heading correction that slip does not explain: 99.9 % of Student's t with NU."""
+STAMP_S: Final = 0.05
+"""Sigma (s) of the time offset between lidar and wheels, before it is known: half a period of a slow lidar."""
 USUAL, TAIL = 0.05, 9.0
 """Share of a correction in their usual mean square, and the most multiple of that which it counts for."""
 SMALL: Final = 1e-4
@@ -275,10 +275,16 @@ def compare(wheels: WheelCalibration, made: Array) -> None:
         wheels.errors = wheels.former = wheels.recent
     if wheels.steps % RECENT == 0:
         wheels.former, wheels.recent = wheels.errors, Errors()
-    if mount_square(wheels.errors) < SOUND[SlowError.MOUNT_YAW] ** 2:
+    if not half_turned(wheels):
         wheels.jumped = 0.0
     wheels.told = judged(wheels.errors, wheels.mount) if wheels.steps >= FEWEST else None
     wheels.fix = wheels.errors.x[:3] if wheels.told is not None and wheels.told.wheels else np.zeros(3)
+
+
+def half_turned(wheels: WheelCalibration) -> bool:
+    """Whether the mount may have turned by half of the heading jump or more; else the robot was turned."""
+    yaw, variance = wheels.errors.x[SlowError.MOUNT_YAW], wheels.errors.P[SlowError.MOUNT_YAW, SlowError.MOUNT_YAW]
+    return abs(float(yaw)) + SURE * math.sqrt(float(variance)) >= 0.5 * abs(wheels.jumped)
 
 
 def slopes_of(wheels: WheelCalibration) -> Array:

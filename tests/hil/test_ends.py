@@ -71,7 +71,7 @@ def test_a_device_that_is_not_there_is_said_once_and_no_other_test_of_it_is_run(
     assert (code, said.count("ERROR at setup")) == (1, 2), said
     listed = said.partition(" short test summary ")[0]  # that repeats as much as the terminal is wide
     for option, problem, remedy in (
-        ("lidar", "/dev/ttyNOPE: no such device", "plug the sensor in"),
+        ("lidar", "/dev/ttyNOPE: no such device", "connect the sensor"),
         ("adc", "/dev/i2c-NOPE: no such bus", "enable I2C"),
     ):
         (failed,) = [one for one in results.values() if one["said"].startswith(f"--{option}=/dev/")]

@@ -118,5 +118,5 @@ def test_the_process_agrees_with_its_textbook_form() -> None:
 
 def test_nothing_to_learn_from_is_said(lesson: tuple[Survey, Rows, Rows]) -> None:
     survey, teach, _ = lesson
-    with pytest.raises(ValueError, match="from 8 places"):
+    with pytest.raises(ValueError, match="from 8 positions"):
         learn(survey, teach.chosen(np.arange(4)))

@@ -53,6 +53,9 @@ class Wire(asyncio.Transport):
         self._client = client
         client.connection_made(self)
 
+    def is_closing(self) -> bool:
+        return self.closed
+
     def write(self, data: bytes | bytearray | memoryview) -> None:
         self.sent += data
         if len(self.sent) > BUFFER_BYTES and not self._full and self._client is not None:
