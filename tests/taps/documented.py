@@ -58,6 +58,7 @@ ELSEWHERE: Final = {
         "tests/daemon/replay/test_recorded_process.py::test_a_dump_is_asked_for_as_the_page_says"
     ),
     r"control.md: lumiloop": "tests/daemon/cli/orders/test_give.py",
+    r"map-files.md: lumiloop switch-map": "tests/daemon/cli/orders/test_give.py",
     r"modbus.md: mbpoll": "tests/daemon/publish/test_document.py::test_the_lines_of_mbpoll_give_every_order",
 }
 """The test that runs it, or what it is made of where the whole takes minutes, hours, or the devices of a computer."""

@@ -219,7 +219,7 @@ def beside(desk: Desk) -> None:
             case ["mbpoll", _]:
                 if shutil.which("mbpoll") is not None:  # a package of Debian's
                     answer = desk.do(command)
-                    assert "1000" not in command or "Written 2 references" in answer
+                    assert "1000" not in command or re.search(r"Written \d+ references", answer)
             case ["curl", _]:
                 pass  # beside the metrics
             case _:
@@ -284,8 +284,8 @@ def test_of_maps(recording: Path, tmp_path: Path) -> None:
         "out/intel/map.lumimap",
     ):
         assert (tmp_path / name).stat().st_size > 0, name
-    # a name, another frame, an import; and the replay's
-    assert len(list(tmp_path.rglob("*.lumimap"))) == before + 4
+    # a name, another frame, two imports; and the replay's
+    assert len(list(tmp_path.rglob("*.lumimap"))) == before + 5
 
 
 @pytest.mark.system
