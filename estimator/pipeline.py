@@ -141,7 +141,6 @@ def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
         wheel_calibration.on_heading(
             state.wheels, float(match.correction[2]), variance, float(state.motion.velocity[2])
         )
-    T_before, t_before = state.matching.T_odom_scan, state.matching.t_scan
     more = fuse(state.pose, state.motion, state.matching, match, state.settings.noise)
     if more is not None:  # the path too, or no loop could join submaps again
         state.map.graph.loosen(more, state.pose.T_odom_anchor)
@@ -149,9 +148,8 @@ def fuse_match(state: State, scan: Scan, match: MatchResult) -> None:
     time_offset.on_match(state.time_offset, scan, match)
     if state.settings.calibrate:
         complete = match.ok and bool(match.known_axes.all()) and loose_direction(match.information) is None
-        if match.ok:
-            turned = se2.between(T_before, match.T_odom_base)[2]
-            gyro_calibration.on_match(state.wheels.gyro, float(turned), state.motion.t_mono - t_before)
+        if match.ok and match.known_axes[2]:
+            gyro_calibration.on_match(state.wheels.gyro, state.motion.t_mono, float(match.T_odom_base[2]))
         wheel_calibration.on_match(state.wheels, state.motion.t_mono, state.motion.T_odom_base, complete)
 
 

@@ -48,4 +48,5 @@ def correct(wheels: WheelCalibration, motion: Motion, matching: MatchMemory, pos
     )
     wheels.begun = wheels.waiting = None
     wheels.jumped = 0.0
+    wheels.gyro.restart()
     return True

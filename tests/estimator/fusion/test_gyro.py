@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from estimator.fusion import gyro_calibration
 from estimator.fusion.gyro_calibration import GyroCalibration
 from estimator.fusion.motion_model import Motion, MotionNoise, on_imu, on_odometry
 from estimator.measurements import Imu, Odometry
+from estimator.numerics import se2
 
 NOISE = MotionNoise()
 STEP = 0.01
@@ -67,43 +70,92 @@ def test_degrees_in_place_of_radians_turn_nothing_while_something_else_tells_the
         assert float(motion.T_odom_base[2]) == pytest.approx(heading, abs=1e-6)
 
 
-def measured(gyro: GyroCalibration, factor: float, seconds: float, begin: float = 0.0, late: int = 0) -> bool:
-    """Drive with turns at 0.6 rad/s to both sides; returns whether the last reading may be used."""
-    noise, used = np.random.default_rng(round(1000 * begin)), True
-    times = begin + STEP * np.arange(round(seconds / STEP))
-    rates = 0.6 * np.sin(0.7 * times)
-    for k, t in enumerate(times.tolist()):
-        read = factor * float(rates[max(k - late, 0)]) * STEP + 0.02 * STEP + noise.normal(0.0, 5e-4)
-        used = gyro_calibration.usable(gyro, Imu(t, t + STEP, read))
-        if k % 10 == 9:
-            turned = float(rates[k - 9 : k + 1].sum()) * STEP + noise.normal(0.0, 2e-3)
-            gyro_calibration.on_match(gyro, turned, 10 * STEP)
-    return used
+def sine(t: float) -> float:
+    """Turn rate (rad/s) of a drive with turns to both sides."""
+    return 0.6 * float(np.sin(0.7 * t))
+
+
+def measured(
+    gyro: GyroCalibration,
+    rate: Callable[[float], float],
+    factor: float = 1.0,
+    span: tuple[float, float] = (0.0, 60.0),
+    hz: int = 10,
+    late_s: float = 0.0,
+    waits: int = 0,
+    knocked: float = 0.0,
+) -> list[float]:
+    """Play readings at 200 Hz and matches with a noise of 2 mrad; returns the factors named after each match.
+
+    ``late_s``: of the gyro's stamps. ``waits``: matches by which scans arrive late. ``knocked``: the lidar mount at the
+    middle, rad.
+    """
+    noise, dt, named = np.random.default_rng(round(1000 * span[0])), 0.005, []
+    heading = sum(rate(dt * k) * dt for k in range(round(span[0] / dt)))
+    matches: list[tuple[float, float]] = []
+    for k in range(round((span[1] - span[0]) / dt)):
+        t = span[0] + dt * k
+        reading = Imu(t, t + dt, factor * rate(t - late_s) * dt + 0.02 * dt + float(noise.normal(0.0, 2e-4)))
+        used = gyro_calibration.usable(gyro, reading)
+        assert used is (gyro.told is None and abs(reading.dyaw) < 10.0 * dt)
+        heading += rate(t) * dt
+        if (k + 1) % round(1.0 / hz / dt) == 0:
+            off = knocked if t > 0.5 * sum(span) else 0.0
+            matches.append((t + dt, se2.wrap(heading + off + float(noise.normal(0.0, 2e-3)))))
+            if len(matches) > waits:
+                gyro_calibration.on_match(gyro, *matches.pop(0))
+                named += [] if gyro.told is None else [gyro.told]
+    return named
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.95, 1.05])
-@pytest.mark.parametrize("late", [0, 10])
-def test_a_sound_gyro_is_used(factor: float, late: int) -> None:
-    """Also if its stamps are 0.1 s late."""
-    gyro = GyroCalibration()
-    assert measured(gyro, factor, 60.0, late=late)
-    assert gyro.told is None
+@pytest.mark.parametrize("late_s", [0.0, 0.1, -0.1])
+@pytest.mark.parametrize("hz", [10, 40])
+def test_a_sound_gyro_is_used(factor: float, late_s: float, hz: int) -> None:
+    """Also if its stamps, or those of the lidar, are 0.1 s late."""
+    assert not measured(GyroCalibration(), sine, factor, hz=hz, late_s=late_s)
 
 
 @pytest.mark.parametrize("factor", [57.3, -1.0, 2.0, 0.5, -57.3, 0.0])
-def test_a_wrong_factor_is_named_as_long_as_it_lasts_and_the_gyro_is_not_used(factor: float) -> None:
+@pytest.mark.parametrize("waits", [0, 8])
+def test_a_wrong_factor_is_named_as_long_as_it_lasts(factor: float, waits: int) -> None:
+    """Also where every scan arrives 0.8 s after the readings of its instant."""
     gyro = GyroCalibration()
-    assert measured(gyro, 1.0, 60.0)
-    assert not measured(gyro, factor, 20.0, 60.0)
-    assert not measured(gyro, factor, 80.0, 80.0)
-    assert gyro.told == pytest.approx(factor, rel=0.02, abs=0.02)
-    assert measured(gyro, 1.0, 200.0, 160.0)
-
-
-def test_a_robot_that_does_not_turn_shows_nothing_of_its_gyro() -> None:
-    gyro, noise = GyroCalibration(), np.random.default_rng(1)
-    for k in range(2000):
-        gyro_calibration.usable(gyro, Imu(STEP * k, STEP * (k + 1), float(noise.normal(0.0, 5e-4))))
-        if k % 10 == 9:
-            gyro_calibration.on_match(gyro, float(noise.normal(0.0, 2e-3)), 10 * STEP)
+    assert not measured(gyro, sine, waits=waits)
+    assert measured(gyro, sine, factor, (60.0, 80.0), waits=waits)
+    named = measured(gyro, sine, factor, (80.0, 160.0), waits=waits)
+    assert len(named) == 800 - waits
+    assert named[-1] == pytest.approx(factor, rel=0.02, abs=0.02)
+    measured(gyro, sine, 1.0, (160.0, 220.0), waits=waits)
     assert gyro.told is None
+
+
+@pytest.mark.parametrize("factor", [57.3, -1.0, 2.0, 0.5, 0.0])
+def test_a_wrong_factor_is_named_in_the_first_turn_after_a_straight_drive(factor: float) -> None:
+    assert measured(GyroCalibration(), lambda t: 0.8 if 10.0 < t < 12.0 else 0.0, factor, (0.0, 14.0))
+
+
+@pytest.mark.parametrize("hz", [10, 40])
+@pytest.mark.parametrize("knocked", [0.0, 0.1, -0.2])
+def test_noise_of_matches_and_a_knocked_mount_are_no_error_of_the_gyro(hz: int, knocked: float) -> None:
+    assert not measured(GyroCalibration(), lambda _: 0.0, span=(0.0, 30.0), hz=hz, knocked=knocked)
+
+
+@pytest.mark.parametrize("late_s", [0.1, -0.1])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_time_offset_in_a_drive_of_sharp_turns_is_no_error_of_the_gyro(late_s: float, seed: int) -> None:
+    """The turn rate changes in steps, often after a rest."""
+    drawn = np.random.default_rng(seed)
+    ends, rates = np.cumsum(drawn.uniform(0.3, 4.0, 60)), drawn.uniform(-1.5, 1.5, 61)
+    rates[drawn.random(61) < 0.5] = 0.0
+    assert not measured(GyroCalibration(), lambda t: float(rates[np.searchsorted(ends, t)]), hz=40, late_s=late_s)
+
+
+def test_a_gyro_whose_readings_arrive_after_the_scan_is_compared_too() -> None:
+    gyro = GyroCalibration()
+    for k in range(400):
+        t = 0.05 * (k + 1)
+        gyro_calibration.on_match(gyro, t, 0.6 * float(np.sin(t)))
+        before = t - 0.05
+        gyro_calibration.usable(gyro, Imu(before - 0.2, t - 0.2, -0.6 * float(np.sin(t - 0.2) - np.sin(before - 0.2))))
+    assert gyro.told == pytest.approx(-1.0, abs=0.02)
