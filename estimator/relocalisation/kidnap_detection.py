@@ -9,7 +9,8 @@ possible where something other than driving has happened:
 * The scene changes from one scan to the next (`scene_change`).
 * The wheels are at rest, and for a while scans see through much of the map around (`was_strange`).
 
-One search of the whole map then decides. If another pose fits nearly as well, relocalisation starts. After a scene
+One search of the whole map then decides. If another pose fits nearly as well, relocalisation starts. It does not where
+the map confirms the pose, and neither a jump, a surprising match nor a changed scene shows a motion. After a scene
 change it also starts if the pose itself is excluded and another one fits. After a jump it also starts where the pose is
 not confirmed, there or in the local map. All other causes may be a door, a table that was carried away, or a person who
 has left. Until the result arrives no keyframe is created. While light gives the pose, light decides instead, see
@@ -146,7 +147,8 @@ def raised(state: Owners, scan: Scan, points: ScanPoints, match: MatchResult) ->
         doubt.fitted = max(doubt.fitted + 1, ROW if leapt else 0)
     else:
         doubt.share += LEARNING * (share - doubt.share) if doubt.share else share
-    if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt or doubt.again) and share > doubt.share - CHANGED:
+    open_ = doubt.since > 0 and doubt.question is None  # a search has ended without a result
+    if doubt.fitted >= ROW and not (doubt.odd or doubt.leapt or open_) and share > doubt.share - CHANGED:
         doubt.fitted, doubt.opportunity = 0, False  # the same view from the same position
     if doubt.question is not None and state.motion.t_mono - doubt.t_asked > GIVEN_UP_S:
         give_up(state, doubt.question)
@@ -222,7 +224,7 @@ def give_up(state: Owners, question: Question) -> None:
     """Abandon a search, which has to be repeated."""
     doubt = state.relocalisation.suspicion
     state.map.graph.jobs.cancel(question)
-    doubt.question, doubt.fitted, doubt.odd = None, max(doubt.fitted, ROW), True
+    doubt.question, doubt.fitted, doubt.odd = None, max(doubt.fitted, ROW), doubt.odd or question.odd
     doubt.jumped, doubt.again = doubt.jumped or question.jumped, question.again
     doubt.leapt |= question.leapt
     doubt.opportunity |= question.opportunity
@@ -288,7 +290,7 @@ def answered(state: Owners, asked: Question, payload: object) -> None:
     doubt.question = None
     if elsewhere(asked, payload):
         carried_off(state, dead_reckoning=state.motion.odometry and not asked.moved())
-    elif payload.complete or not asked.opportunity:
+    elif payload.complete or not asked.opportunity or confirmed(asked, payload):
         doubt.since = state.map.graph.cut_at = 0
     elif asked.again:  # a search that was cut off is no evidence: the pose is neither given up nor confirmed
         carried_off(state, dead_reckoning=state.motion.odometry)
@@ -309,12 +311,20 @@ def elsewhere(asked: Question, looked: Looked) -> bool:
     excluded = here.verdict is Verdict.NO
     if not asked.opportunity:
         return excluded and not asked.holds and any(fit.verdict is Verdict.HOLDS for fit, _ in looked.fresh)
-    if here.verdict is Verdict.HOLDS and not asked.moved():
-        return False  # another place that fits too is no evidence against the prior
+    if confirmed(asked, looked):
+        return False
     own = here.share if excluded else max(here.share, asked.share)
     least = 0.0 if asked.leapt and excluded else max(global_scan_match.LEAST, own - BEHIND)
     rivals = any(fit.share >= least for fit, _ in looked.fresh)
     return rivals or (asked.jumped and not asked.holds and here.verdict is not Verdict.HOLDS)
+
+
+def confirmed(asked: Question, looked: Looked) -> bool:
+    """Whether the map confirms the pose, and nothing shows a motion.
+
+    Another place that fits too is then no evidence against the prior, and no further search can show more.
+    """
+    return looked.guesses[0].verdict is Verdict.HOLDS and not asked.moved()
 
 
 def carried_off(state: Owners, dead_reckoning: bool = False) -> None:

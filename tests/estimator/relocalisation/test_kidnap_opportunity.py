@@ -29,6 +29,29 @@ def test_without_a_sign_of_motion_another_place_that_fits_is_no_reason_to_give_o
     assert state.map.parts.detached is None or relocalisation.dead_reckons(state) is not odd
 
 
+@pytest.mark.parametrize(("own", "carried"), [(Verdict.HOLDS, False), (Verdict.OPEN, True)])
+def test_a_search_that_is_cut_off_twice_gives_no_pose_up_that_the_map_confirms(own: Verdict, carried: bool) -> None:
+    robot = driven(CUPBOARD, ABOUT)
+    assert robot.T is not None
+    here = Fit(robot.T, np.eye(3), 0.7, 0.0, 0.01, 1, np.zeros(3), own)
+    state = robot.state
+    state.relocalisation.suspicion.question = asked = Question(False, True, True, share=0.6, odd=False)
+    kidnap_detection.answered(state, asked, Looked(None, (here,), (), False, 0))  # type: ignore[arg-type]
+    assert (state.map.parts.detached is not None) is carried
+
+
+def test_a_lost_search_is_repeated_and_is_no_sign_of_motion() -> None:
+    robot = driven(CUPBOARD, ABOUT)
+    assert robot.T is not None
+    doubt, lost = robot.state.relocalisation.suspicion, Question(False, True, False, odd=False)
+    doubt.question, doubt.t_asked, doubt.since = lost, robot.t - 11.0, robot.state.map.next_key
+    robot.late = 45
+    for _ in range(6):
+        robot.at(robot.T)
+    assert doubt.question not in (None, lost)
+    assert not doubt.question.moved()
+
+
 @pytest.mark.parametrize(
     ("shares", "unresolved"),
     [((), True), ((-1.0, -1.0), True), ((0.0, 0.0), False), ((0.2, 0.25, 0.2), False), ((0.6, 0.8, 0.7), True)],
