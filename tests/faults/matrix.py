@@ -313,11 +313,16 @@ def _named(cell: Cell, out: Outcome) -> Iterator[str]:
         yield f"the last fault was named {out.gone:.1f} s after it was over, {cell.gone} s allowed"
 
 
+DISTURBANCES: Final = "daemon.integrity.light_disturbance"
+"""Logger of what disturbs the light without being a fault."""
+
+
 def _said(cell: Cell, out: Outcome) -> Iterator[str]:
     """One line each way for every fault that a daemon has named; it may stop before one is over."""
     for number, (sights, lines) in enumerate(out.spells()):
         named = {int(fault) for sight in sights for fault in sight.faults}
-        come = [_code(line) for line in lines if line.level >= logging.WARNING]
+        warnings = [line for line in lines if line.level >= logging.WARNING and line.name != DISTURBANCES]
+        come = [_code(line) for line in warnings]
         gone = [_code(line) for line in lines if line.text.startswith("over: ")]
         stopped = cell.time == "stop" and number == 0
         if len(come) != len(set(come)) or not named <= set(come) <= {*cell.codes, *cell.also}:

@@ -126,7 +126,7 @@ def test_inner_and_mixed_are_products_with_a_vector(rows: int) -> None:
 
 def test_cut_puts_each_period_into_a_row_of_its_own() -> None:
     rng, x = np.random.default_rng(4), np.arange(-140.0, 140.0, 0.9)
-    chips, lamps, n = gold_codes(7)[:2].copy(), np.array([[263.7, 141.0], [1.0, 1.001]]), len(x)
+    chips, lamps, n = gold_codes(7)[:2].copy(), np.array([[263.7, 141.0], [1.0, 1.001], [0.0, 0.0]]), len(x)
     samples, drive = np.stack([x, (rng.random(n) > 0.1).astype(float), rng.normal(size=n)]), np.array([3.0, 0.0])
     bounds, index = np.empty((2, 6), np.int64), np.empty((4, 10), np.int64)
     count = code_period_kernels.lay_out(chips, lamps, samples, 3, bounds, index)
