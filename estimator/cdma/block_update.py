@@ -59,7 +59,6 @@ QUIET: Final = 1.2
 SPURIOUS: Final = 0.01
 """Share of the strongest lamp's amplitude below which errors of the pulse shape can look like lamps."""
 
-
 RESTED: Final = 3
 """Blocks after a twin was found until the next test: the twin is judged, and all lamps are tracked meanwhile."""
 
@@ -68,13 +67,11 @@ SOON, UNTESTED = 4, 32
 the second one while no twin is found.
 """
 
-
 ASTRAY: Final = 0.3
 """Share of its twin's amplitude below which a lamp has been followed at a wrong phase, and is dropped."""
 
 UNKNOWN_PAUSES: Final = 0.5
 """Relative sigma of all amplitudes in blocks that take too long, while it is not known where the bus pauses."""
-
 
 _TENTATIVE, _UNUSUAL, _STALLED = int(Life.TENTATIVE), ~int(USUAL), int(BlockFlag.STALLED)
 _MENDED, _NOISY, _CLIPPED = int(BlockFlag.MENDED), int(BlockFlag.NOISY), int(BlockFlag.CLIPPED)

@@ -55,7 +55,8 @@ def on_odometry(matching: MatchMemory, record: Odometry) -> None:
 
 def repeated(matching: MatchMemory, scan: Scan) -> bool:
     """Whether a scan equals the ones before it although the robot has moved; few returns may be equal by chance."""
-    if int(np.count_nonzero(scan.beam == Beam.HIT)) <= FEW or not np.array_equal(scan.range_m, matching.first_alike):
+    few = int(np.count_nonzero(scan.beam == Beam.HIT)) <= FEW
+    if few or not np.array_equal(scan.range_m, matching.first_alike, equal_nan=True):
         matching.first_alike, matching.driven = scan.range_m, se2.identity()
         return False
     x, y, yaw = matching.driven.tolist()

@@ -106,7 +106,7 @@ class Attack:
                     send(mend(data) if chance.random() < 0.5 else data)
                 except OSError:  # it hangs up, as it may
                     self.sent[f"{door} refused"] += 1
-                except Exception as error:  # noqa: BLE001  shown with the result
+                except Exception as error:  # noqa: BLE001  an attacker's thread must not end unseen; it is shown with the result
                     self.broken.append(f"{door}: {error!r}")
                     return
                 self.sent[door] += 1
@@ -119,7 +119,7 @@ class Attack:
         def guarded() -> None:
             try:
                 work()
-            except Exception as error:  # noqa: BLE001  shown with the result
+            except Exception as error:  # noqa: BLE001  an attacker's thread must not end unseen; it is shown with the result
                 self.broken.append(repr(error)[:500])
 
         thread = threading.Thread(target=guarded, daemon=True)

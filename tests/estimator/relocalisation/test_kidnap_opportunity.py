@@ -23,7 +23,8 @@ def test_without_a_sign_of_motion_another_place_that_fits_is_no_reason_to_give_o
     other = Fit(OTHER_END, np.eye(3), 0.86, 0.0, 0.01, 1, np.zeros(3), Verdict.HOLDS)
     state = robot.state
     state.relocalisation.suspicion.question = asked = Question(False, False, False, share=0.6, odd=odd)
-    kidnap_detection.answered(state, asked, Looked(None, (here,), ((other, ()),), True, 0))  # type: ignore[arg-type]
+    looked = Looked(None, (here,), ((other, ()),), True, 0)  # type: ignore[arg-type]  # nothing asks for the terrain
+    kidnap_detection.answered(state, asked, looked)
     assert (state.map.parts.detached is not None) is (odd or own is not Verdict.HOLDS)
     state.motion.odometry = True
     assert state.map.parts.detached is None or relocalisation.dead_reckons(state) is not odd
@@ -36,7 +37,8 @@ def test_a_search_that_is_cut_off_twice_gives_no_pose_up_that_the_map_confirms(o
     here = Fit(robot.T, np.eye(3), 0.7, 0.0, 0.01, 1, np.zeros(3), own)
     state = robot.state
     state.relocalisation.suspicion.question = asked = Question(False, True, True, share=0.6, odd=False)
-    kidnap_detection.answered(state, asked, Looked(None, (here,), (), False, 0))  # type: ignore[arg-type]
+    looked = Looked(None, (here,), (), False, 0)  # type: ignore[arg-type]  # nothing asks for the terrain
+    kidnap_detection.answered(state, asked, looked)
     assert (state.map.parts.detached is not None) is carried
 
 
