@@ -41,9 +41,6 @@ STAMP_MARGIN_S: Final = 120e-6
 TOO_LONG_S: Final = 2.0 * STAMP_MARGIN_S
 """Excess of the time between a block's stamps over that of its samples from which it contains pauses, s."""
 
-MOST_CLOCKS: Final = 15
-"""Further sample clocks that are tried, `BIN` apart: up to 3 %."""
-
 BETTER_CLOCK: Final = 1.1
 """Correlation with another sample clock, over that with the present one, from which it is taken."""
 
@@ -129,9 +126,10 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
     """
     tracks, clocks = decoder.tracks, decoder.clocks
     tracks.merge_twins()
-    excess = max(block.t_end - block.t_begin - len(sampled.x) / block.rate * (1.0 + clocks.clock), 0.0)
-    clocks.measure((block.t_end - block.t_begin) * block.rate / len(sampled.x) - 1.0)
-    unknown = 0.0 if clocks.known else decoder.profile.clock_ppm * 1e-6 * (block.t_end - block.t_begin)
+    took, nominal = block.t_end - block.t_begin, len(sampled.x) / decoder.profile.sample_rate
+    excess = max(took - nominal * (1.0 + clocks.clock), 0.0)
+    clocks.measure(took / nominal - 1.0)
+    unknown = 0.0 if clocks.known else decoder.profile.clock_ppm * 1e-6 * took
     decoder.time_base.on_stamps(excess - unknown > TOO_LONG_S)
     if not len(tracks.slots):
         clocks.rest()
@@ -166,7 +164,8 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
         decoder.colour.learn(solved.fit.residual)
     lasting = (not noisy or decoder.odd >= PATIENCE) and not (tracks.shared and solved.newcomers)  # a twin on trial
     if lasting and not found & ~(_CLIPPED | _NOISY) and len(tracks.confirmed):
-        decoder.slow_lamps.learn(solved.block, solved.prior, solved.fit, decoder.shape, tracks.code, solved.slots)
+        codes = tracks.code[solved.slots]
+        decoder.slow_lamps.learn(solved.block, solved.prior, solved.fit, decoder.shape, codes, solved.slots)
     return flags, replace(solved.block, y=solved.fit.residual)
 
 
@@ -210,7 +209,7 @@ def _try_clocks(decoder: Decoder, sampled: Sampled, excess: float) -> Sampled:
     The lamps keep their phases in the middle of a block. Returns the block with the times of the clock chosen.
     """
     clocks, before = decoder.clocks, decoder.clocks.clock
-    trials = before + BIN * np.arange(min(math.ceil((clocks.stretch - before) / BIN), MOST_CLOCKS) + 1)
+    trials = before + BIN * np.arange(max(math.ceil((clocks.stretch - before) / BIN), 0) + 1)
     score = [_find_lag(decoder, sampled, excess, clock)[1] for clock in trials.tolist()]
     best = int(np.argmax(score))
     if score[best] < BETTER_CLOCK * score[0]:

@@ -202,6 +202,11 @@ class Shape:
         if abs(error) > 4.0 * WORTH:
             self._wait = SOON
 
+    def forget(self, slots: Index) -> None:
+        """Return slots that have another lamp now to the usual table, at once: that lamp was found with it."""
+        self.rise_s[slots] = self.made_s[slots] = self._usual_s
+        self.pulse[slots] = self.loss[slots] = 0.0
+
     def set_corner(self, corner: float) -> None:
         """Set the estimate of the corner, within its tolerance."""
         self.corner = float(np.clip(corner, 1.0 - REACH, 1.0 + REACH))

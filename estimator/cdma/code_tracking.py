@@ -61,6 +61,9 @@ UNTRIED: Final = 1.5e-4
 MISTAKEN: Final = 1e-3
 """One sigma of a sample clock that lamps contradict: an eighth of a chip at the ends of a block."""
 
+SLOWEST: Final = 0.03
+"""Largest relative distance of samples that pauses of the bus may add; more of them leave no code intact."""
+
 STRETCH_GAIN: Final = 0.125
 """Share of a block in the averaged distance of samples by the time stamps."""
 
@@ -126,7 +129,7 @@ class Clocks:
 
     def measure(self, stretch: float) -> None:
         """Average the time between a block's stamps over that of its samples at the nominal clock, less 1."""
-        self.stretch += STRETCH_GAIN * (stretch - self.stretch)
+        self.stretch += STRETCH_GAIN * (min(max(stretch, -SLOWEST), SLOWEST) - self.stretch)
 
     def doubt(self) -> None:
         """Widen the prior of the sample clock: lamps contradict it."""

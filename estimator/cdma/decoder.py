@@ -60,9 +60,6 @@ _UNUSUAL, _UNUSABLE = ~int(USUAL), int(UNUSABLE)
 _FAINT, _TWIN, _SLOW = int(LinkFlag.FAINT), int(LinkFlag.TWIN), int(LinkFlag.SLOW)
 """Flags as plain numbers: enum operations are slow."""
 
-SLOWEST: Final = 0.03
-"""Largest relative distance of samples that pauses of the bus may add; more of them leave no code intact."""
-
 FULL_ROUND: Final = 8
 """Sweeps without a confirmed lamp until all sample clocks are tried."""
 
@@ -182,7 +179,7 @@ def _trial_clocks(decoder: Decoder) -> list[float]:
             tracks.drop(int(slot))
         decoder.offered = None
     reach = round(decoder.profile.clock_ppm * 1e-6 / BIN)
-    slowest = max(reach, math.ceil(min(clocks.stretch, SLOWEST) / BIN))
+    slowest = max(reach, math.ceil(clocks.stretch / BIN))
     return [k * BIN for k in range(-reach, slowest + 1)]
 
 
@@ -217,7 +214,7 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
         return None, BlockFlag.MALFORMED
     if not abs(block.rate / profile.sample_rate - 1.0) <= RATE:
         return None, BlockFlag.MALFORMED
-    if not 1.0 <= n / (block.rate * profile.period_s) <= LONGEST:
+    if not 1.0 <= n / (profile.sample_rate * profile.period_s) <= LONGEST:
         return None, BlockFlag.LENGTH
     low, high = float(words.min()), float(words.max())
     if low < 0.0 or high > top:
@@ -238,7 +235,7 @@ def _prepare(decoder: Decoder, block: SampleBlock) -> tuple[Sampled | None, Bloc
             return None, flags | BlockFlag.SATURATED
     y = (words - 0.5 * (top + 1.0)) * mask
     rows = decoder.background.rows(y, mask, still is not None)
-    chips = profile.chip_rate / block.rate * (1.0 + decoder.clocks.clock)
+    chips = profile.chip_rate / profile.sample_rate * (1.0 + decoder.clocks.clock)
     at: Array = np.arange(n, dtype=np.float64) - 0.5 * (n - 1)
     if decoder.time_base.uneven:
         flags |= BlockFlag.UNEVEN

@@ -81,7 +81,7 @@ class SlowLamps:
         self._code = np.full(slots, -1)
         self._sums = np.zeros((2, slots))  # excess of the square by weight, weight
         self._own, self._common = np.zeros(slots), 0.0
-        self._covariance = np.diag([1.0] * slots + [SHARED, 1.0])
+        self._covariance = _unmeasured(slots)
         self._slow = np.zeros(slots, np.bool_)
         self._wait, self._updates = SOON, 0
         self._joint, self._astray = False, True
@@ -89,7 +89,7 @@ class SlowLamps:
     def learn(self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, codes: Index, slots: Index) -> None:
         """Learn from one more block, every few blocks; the corner, too, once there are slow lamps.
 
-        ``codes``: of all slots; ``slots``: of the lamps in the fit.
+        ``codes``, ``slots``: of the lamps in the fit.
         """
         if not self._joint:
             shape.learn(block, prior, fit)
@@ -98,8 +98,7 @@ class SlowLamps:
         if (self._wait > 0 and not suspect) or (self._joint and shape.behind(slots)):
             return
         self._updates += 1
-        self._start(slots[self._code[slots] != codes[slots]], shape)
-        self._code[slots] = codes[slots]
+        self._assign(slots, codes, shape)
         self._wait = SOON if self._updates < SETTLED else LATER if self._joint else SELDOM
         if self._joint:
             self._estimate(block, prior, fit, shape, slots)
@@ -132,15 +131,17 @@ class SlowLamps:
         weights = inner(rows, light)
         return float(np.vdot(light, light) - np.vdot(weights, weights))
 
-    def _start(self, slots: Index, shape: Shape) -> None:
-        """Forget what was known of these slots: they have other lamps now."""
-        if not len(slots):
+    def _assign(self, slots: Index, codes: Index, shape: Shape) -> None:
+        """Forget what was known of slots that have another lamp now."""
+        new = slots[self._code[slots] != codes]
+        if not len(new):
             return
+        self._code[slots] = codes
         self._updates = 0
-        self._sums[:, slots], self._slow[slots] = 0.0, False
-        self._own[slots], shape.rise_s[slots] = 0.0, self._usual_s
-        self._covariance[slots], self._covariance[:, slots] = 0.0, 0.0
-        self._covariance[slots, slots] = 1.0
+        self._sums[:, new], self._slow[new], self._own[new] = 0.0, False, 0.0
+        self._covariance[new], self._covariance[:, new] = 0.0, 0.0
+        self._covariance[new, new] = 1.0
+        shape.forget(new)
 
     def _test(self, block: Sampled, prior: Prior, fit: Fit, shape: Shape, slots: Index) -> bool:
         """Average the excess that the residual indicates; returns whether a lamp is evidently slow."""
@@ -177,32 +178,36 @@ class SlowLamps:
         ahead = np.append(self._ahead(slots, shape) / SQUARE, off / CORNER)
         left = fit.residual - mixed(ahead, rows)  # beyond what the tables do not contain yet
         rows = np.insert(rows, len(slots), rows[:-1].sum(axis=0), axis=0)
-        seen = np.ix_(*(np.append(slots, (-2, -1)),) * 2)
+        seen = np.append(slots, (-2, -1))
         if self._astray:
-            self._covariance[seen] = np.diag([1.0] * len(slots) + [SHARED, 1.0])
-        precision = np.linalg.inv(self._covariance[seen]) + np.einsum("ik,jk->ij", rows, rows) / fit.noise_var
+            self._covariance = _unmeasured(len(self._own))
+        before = self._covariance[np.ix_(seen, seen)]
+        information = np.linalg.inv(before)
+        precision = information + np.einsum("ik,jk->ij", rows, rows) / fit.noise_var
         pull = inner(rows, left) / fit.noise_var
         covariance, step = _solved(precision, pull)
         if not shape.possible(shape.corner + CORNER * float(step[-1])):
             precision[-1, -1] += PINNED  # the rise times must not make up for what is cut off
             covariance, step = _solved(precision, pull)
         self._astray = bool((np.abs(step) > ASTRAY * np.sqrt(np.diag(covariance))).any())
-        walk = np.append(np.full(len(slots) + 1, SQUARE_WALK / SQUARE), CORNER_WALK / CORNER)
-        covariance[np.diag_indices(len(rows))] += walk**2
-        self._covariance[seen] = covariance
-        self._move(slots, step, shape)
+        spread = np.einsum("ij,jk->ik", self._covariance[:, seen], information)  # to the lamps out of view, too
+        change = np.einsum("ij,jk->ik", spread, covariance - before)
+        self._covariance += np.einsum("ik,lk->il", change, spread)
+        walk = np.append(np.full(len(self._own) + 1, SQUARE_WALK / SQUARE), CORNER_WALK / CORNER)
+        self._covariance[np.diag_indices(len(walk))] += walk**2
+        self._move(np.einsum("ij,j->i", spread, step), shape)
         if self._astray:
             self._wait = 1
         self._decide(slots, shape)
 
-    def _move(self, slots: Index, step: Array, shape: Shape) -> None:
-        """Apply a step, shortened if it is too long."""
-        moved, before = SQUARE * (step[:-2] + step[-2]), self._excess(slots)
+    def _move(self, step: Array, shape: Shape) -> None:
+        """Apply a step of all slots, shortened if it is too long."""
+        moved, before = SQUARE * (step[:-2] + step[-2]), self._own + self._common
         most = (np.sqrt(np.maximum(before + self._usual_s**2, 0.0)) + FURTHER_S) ** 2
         part = min(1.0, float(((most - before) / np.maximum(moved, 1e-30))[moved > 0.0].min(initial=1.0)))
         self._astray |= part < 1.0
         self._common = min(max(self._common + part * SQUARE * float(step[-2]), -(self._usual_s**2)), SLOWEST_S**2)
-        self._own[slots] = np.clip(before + part * moved, -(self._usual_s**2), SLOWEST_S**2) - self._common
+        self._own = np.clip(before + part * moved, -(self._usual_s**2), SLOWEST_S**2) - self._common
         shape.set_corner(shape.corner + part * CORNER * float(step[-1]))
 
     def _decide(self, slots: Index, shape: Shape) -> None:
@@ -237,10 +242,11 @@ class SlowLamps:
         return slow
 
     def pulse(self, slots: Index, codes: Index, shape: Shape) -> Array:
-        """Number of the pulse table of each of these lamps."""
+        """Number of the pulse table of each of these lamps; called at the begin of each block."""
         if not self._joint:
             return np.zeros(len(slots))
-        pulse: Array = shape.pulse[slots] * (self._code[slots] == codes)
+        self._assign(slots, codes, shape)
+        pulse: Array = shape.pulse[slots]
         return pulse
 
     def spread(self, slots: Index, shape: Shape) -> Array | float:
@@ -253,6 +259,11 @@ class SlowLamps:
         by_rise = loss * off / (made_s**2 - self._usual_s**2)
         spread: Array = (DOUBT * shape.loss[slots]) ** 2 + by_rise**2
         return spread
+
+
+def _unmeasured(slots: int) -> Array:
+    """Covariance before any measurement: own parts of the squared rise times, the shared part, the corner."""
+    return np.diag([1.0] * slots + [SHARED, 1.0])
 
 
 def _solved(precision: Array, pull: Array) -> tuple[Array, Array]:

@@ -284,6 +284,27 @@ def test_impossible_times_are_malformed(t1: float, rate: float) -> None:
     assert epoch.block == BlockFlag.MALFORMED
 
 
+def test_a_time_stamp_far_off_before_late_ones_does_no_harm() -> None:
+    run = Run(ceiling(18, currents(4.6, 5.3)[:4]))
+    run.settle(12)
+    for k in range(20):
+        block = run.ceiling.block(run.t, run.samples)
+        run.t = block.t1 + 2e-3
+        end = block.t1 + 400e-6 if k else block.t0 + 1e-6
+        epoch = decode(run.decoder, SampleBlock(block.t0, end, block.words, block.nominal_rate))
+    assert sorted(epoch.ids) == sorted(run.codes())
+
+
+def test_a_nominal_rate_beside_that_of_the_profile() -> None:
+    run = Run(ceiling(18, currents(4.6, 5.3)[:4]), clock_ppm=None)
+    for _ in range(40):
+        block = run.ceiling.block(run.t, run.samples)
+        run.t = block.t1 + 1e-3
+        epoch = decode(run.decoder, SampleBlock(block.t0, block.t1, block.words, 1.005 * block.nominal_rate))
+        search(run.decoder, 600)
+    assert sorted(epoch.ids) == sorted(run.codes())
+
+
 def test_the_same_words_give_the_same_answer() -> None:
     world = ceiling(19)
     blocks = [sampled(world.block(1.0 + 0.0508 * k, 1111)) for k in range(12)]

@@ -57,3 +57,30 @@ def test_a_low_pass_within_its_tolerance_is_not_a_slow_lamp() -> None:
     z, flagged = judged(Run(world))
     assert z < 1.5
     assert max(flagged.values()) < 0.1
+
+
+def test_lamps_come_and_go() -> None:
+    """What is known of lamps out of view stays consistent with what is learned of the others."""
+    world = ceiling(21, np.full(16, 2e-6))
+    world.receiver = replace(world.receiver, led_tau_s=30e-6)
+    lamps, run = world.lamps, Run(world)
+    for some in (lamps[:1], lamps[1:], lamps):
+        world.lamps = some
+        run.settle(80)
+        assert np.linalg.eigvalsh(run.decoder.slow_lamps._covariance).min() > 0.0
+
+
+def test_a_lamp_in_the_place_of_a_slow_one_is_not_slow() -> None:
+    usual, slow = (ceiling(22, currents(4.6, 5.3)[:4]) for _ in range(2))
+    first = usual.lamps[0]
+    usual.lamps[0] = replace(first, code=next(k for k in range(129) if k not in {lamp.code for lamp in slow.lamps}))
+    run = Run(OversampledCeiling(slow, seconds=9.0, rise_s={0: 30e-6}))  # type: ignore[arg-type]  # as above
+    run.settle(60)
+    run.ceiling = usual
+    run.ceiling.lamps, new = usual.lamps[1:], usual.lamps[0]
+    run.settle(25)
+    usual.lamps.append(new)
+    for _, epoch in run.blocks(20):
+        assert not (epoch.flags[epoch.ids == new.code] & LinkFlag.SLOW).any()
+    block, epoch = run.block()
+    assert abs(run.errors(block, epoch)[-1]) < 0.01
