@@ -193,6 +193,38 @@ def mixed(weights: F8, rows: F8) -> F8:
     return out
 
 
+@kernel("void(f8[:,::1], f8[:,::1], f8[:,::1])")
+def combine(weights: F8, rows: F8, out: F8) -> None:
+    """Weighted sums (K, N) of (M, N) rows, each with the weights (M,) of one row of ``weights``, in tiles of 4 x 4."""
+    count, many = weights.shape
+    tiled = many - many % 4
+    out[:] = 0.0
+    for i in range(0, count - 3, 4):
+        a, b, c, d = out[i], out[i + 1], out[i + 2], out[i + 3]
+        wa, wb, wc, wd = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
+        for k in range(0, tiled, 4):
+            p, q, r, s = rows[k], rows[k + 1], rows[k + 2], rows[k + 3]
+            a0, a1, a2, a3 = wa[k], wa[k + 1], wa[k + 2], wa[k + 3]
+            b0, b1, b2, b3 = wb[k], wb[k + 1], wb[k + 2], wb[k + 3]
+            c0, c1, c2, c3 = wc[k], wc[k + 1], wc[k + 2], wc[k + 3]
+            d0, d1, d2, d3 = wd[k], wd[k + 1], wd[k + 2], wd[k + 3]
+            for n in range(p.shape[0]):
+                x, y, z, t = p[n], q[n], r[n], s[n]
+                a[n] += a0 * x + a1 * y + a2 * z + a3 * t
+                b[n] += b0 * x + b1 * y + b2 * z + b3 * t
+                c[n] += c0 * x + c1 * y + c2 * z + c3 * t
+                d[n] += d0 * x + d1 * y + d2 * z + d3 * t
+        for k in range(tiled, many):
+            p = rows[k]
+            for n in range(p.shape[0]):
+                a[n] += wa[k] * p[n]
+                b[n] += wb[k] * p[n]
+                c[n] += wc[k] * p[n]
+                d[n] += wd[k] * p[n]
+    for i in range(count - count % 4, count):
+        out[i] = mixed(weights[i], rows)
+
+
 @kernel("void(f8[:,::1])")
 def invert(a: F8) -> None:
     """Inverse of a symmetric positive definite matrix in place, by sweeping each pivot.

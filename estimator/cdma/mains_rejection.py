@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.cdma.correlation_kernels import gram, inner, invert, mixed, tones
+from estimator.cdma.correlation_kernels import combine, gram, inner, invert, tones
 from estimator.numerics.arrays import Array
 
 FUNDAMENTALS_HZ: Final = (100.0, 120.0)
@@ -50,11 +50,10 @@ def orthonormal(rows: Array) -> tuple[Array, Array]:
     """Orthonormal rows q of the same span, and the lower matrix with ``q = lower @ rows`` (Cholesky of the Gram)."""
     products = np.empty((len(rows), len(rows)))
     gram(rows, len(rows), products)
-    lower = np.linalg.inv(np.linalg.cholesky(products))
+    lower = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(products)))
     out = np.empty_like(rows)
-    for k, (row, weights) in enumerate(zip(out, lower, strict=True)):
-        row[:] = mixed(weights[: k + 1].copy(), rows[: k + 1])
-    return out, np.asarray(lower, np.float64)
+    combine(lower, rows, out)
+    return out, lower
 
 
 class Mains:

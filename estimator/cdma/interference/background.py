@@ -15,8 +15,8 @@ from estimator.cdma.mains_rejection import Mains
 from estimator.cdma.sample_block import Fit
 from estimator.numerics.arrays import Array
 
-MOVED: Final = 0.02
-"""Shift of pulses (samples) that makes the rows of a block stale."""
+MOVED: Final = 0.1
+"""Shift of pulses (samples) that makes the rows of a block stale: they span its square, its cube is 2e-4 of a swing."""
 
 
 class Background:

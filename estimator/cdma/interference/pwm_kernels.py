@@ -20,6 +20,19 @@ RANK = 1e-7
 """Relative energy below which a row adds nothing to the others."""
 
 
+EVEN = 1e-9
+"""Difference of the spacing of samples that is rounding."""
+
+
+@kernel("UniTuple(f8, 2)(f8, f8, f8)", inner=True)
+def decayed(rate: float, turn: float, age: float) -> tuple[float, float]:
+    """Real and imaginary part of ``exp((rate + turn j) * age)``."""
+    fade = math.exp(rate * age)
+    if turn == 0.0:
+        return fade, 0.0
+    return fade * math.cos(turn * age), fade * math.sin(turn * age)
+
+
 @kernel("void(f8[:,::1], f8[::1], f8[::1], f8[:,::1])")
 def trains(modes: F8, pulses: F8, times: F8, out: F8) -> None:
     """Response of the receiver to endless trains of unit steps at phases 0.
@@ -39,17 +52,27 @@ def trains(modes: F8, pulses: F8, times: F8, out: F8) -> None:
         share[0, m] = (modes[2, m] * re + modes[3, m] * im) / power
         share[1, m] = (modes[3, m] * re - modes[2, m] * im) / power
     scale = 1.0 / max(abs(times[0]), abs(times[size - 1]))
+    state, step, cycle = np.empty((2, 2, count)), np.empty((2, count)), np.empty(2)
+    spacing = math.nan
     for n in range(size):
+        if n > 0 and not abs(times[n] - times[n - 1] - spacing) < EVEN:
+            spacing = times[n] - times[n - 1]
+            for m in range(count):
+                step[0, m], step[1, m] = decayed(modes[0, m], modes[1, m], spacing)
         for edge in range(2):
             phase = frequency * times[n] + pulses[1 + edge]
-            age = (phase - math.floor(phase)) / frequency
+            begun = math.floor(phase)
+            follows = n > 0 and begun == cycle[edge]  # the same cycle as the sample before: one step on
+            cycle[edge] = begun
             value, slope, bend = 0.0, 0.0, 0.0
             for m in range(count):
-                fade = math.exp(modes[0, m] * age)
-                turn = modes[1, m] * age
-                c, s = math.cos(turn), math.sin(turn)
-                re = fade * (share[0, m] * c - share[1, m] * s)
-                im = fade * (share[0, m] * s + share[1, m] * c)
+                if follows:
+                    before_re, before_im, c, s = state[edge, 0, m], state[edge, 1, m], step[0, m], step[1, m]
+                else:
+                    before_re, before_im = share[0, m], share[1, m]
+                    c, s = decayed(modes[0, m], modes[1, m], (phase - begun) / frequency)
+                re, im = before_re * c - before_im * s, before_re * s + before_im * c
+                state[edge, 0, m], state[edge, 1, m] = re, im
                 value += re
                 first, other = re * modes[0, m] - im * modes[1, m], re * modes[1, m] + im * modes[0, m]
                 slope += first

@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 
 from estimator.cdma.air_interface import Profile
-from estimator.cdma.correlation_kernels import gram, inner, invert, mixed
+from estimator.cdma.correlation_kernels import inner, mixed
 from estimator.cdma.interference.pwm_detection import fundamental
 from estimator.cdma.interference.pwm_kernels import DRIFT, FALL, FALL_SLOPE, RISE, RISE_SLOPE, harmonics
-from estimator.cdma.interference.pwm_naming import Named, named, order
-from estimator.cdma.interference.pwm_waveform import Chain, Complex, Pulses, orthonormal, without
+from estimator.cdma.interference.pwm_naming import Named, distinct, named, order
+from estimator.cdma.interference.pwm_waveform import Chain, Complex, Pulses, explained, least_squares, orthonormal
 from estimator.numerics.arrays import Array
 
 MOST: Final = 3
@@ -127,8 +127,8 @@ class PwmLamps:
                 self._step(track, clean, times, mains, common=True)
             shift = (track.pulses.rise - before.rise + 0.5) % 1.0 - 0.5
             largest = max(largest, abs(shift) / before.frequency)
-            if len(self._tracks) > 1:
-                clean = clean - mixed(*self._fitted(track.pulses, clean, times, mains))
+            if track is not self._tracks[-1]:
+                clean = clean - self._light(track.pulses, clean, times, mains)[0]
         return largest
 
     def rows(self, times: Array, mask: Array, mains: Array) -> Array:
@@ -155,10 +155,11 @@ class PwmLamps:
             mains: orthonormal rows.
         """
         self._together = self._together + 1 if len(self._tracks) > 1 else 0
-        if self._together % MERGE_EVERY == MERGE_EVERY // 2:
-            self._merge(light - mixed(inner(mains, light), mains), mains)
         if self._tracks:
-            self._follow(light - mixed(inner(mains, light), mains), residual, mains)
+            clean, noise = light - mixed(inner(mains, light), mains), float(np.vdot(residual, residual)) / len(residual)
+            if self._together % MERGE_EVERY == MERGE_EVERY // 2 and not self._drop_repeated(clean, noise, mains):
+                self._merge(clean, mains)
+            self._follow(clean, noise, mains)
         if len(self._tracks) < MOST:
             self._look_for(light, residual, mains)
 
@@ -175,6 +176,25 @@ class PwmLamps:
         self._unlooked, self._searched = 0, energy
         return True
 
+    def _drop_repeated(self, clean: Array, noise: float, mains: Array) -> bool:
+        """Drop the lamp that adds least to the others, if that is not significant; returns whether there was one.
+
+        Such a track follows some of the lines of another lamp.
+        """
+        times, added = _centred(len(clean)), []
+        for track in self._tracks:
+            known = mains
+            for other in self._tracks:
+                if other is not track:
+                    known = np.concatenate((known, orthonormal(self._chain.rows(other.pulses, times), known)))
+            _, energy, rank = explained(self._chain.rows(track.pulses, times), known, clean)
+            added.append(energy / (max(rank, 1) * noise + 1e-30))
+        least = int(np.argmin(added))
+        if added[least] > SIGNIFICANT:
+            return False
+        del self._tracks[least]
+        return True
+
     def _merge(self, clean: Array, mains: Array) -> None:
         """Replace two lamps by one if they are multiples of a frequency whose edges explain the light of both."""
         times = _centred(len(clean))
@@ -185,37 +205,34 @@ class PwmLamps:
             rest = clean
             for track in self._tracks:
                 if track is not a and track is not b:
-                    rest = rest - mixed(*self._fitted(track.pulses, rest, times, mains))
+                    rest = rest - self._light(track.pulses, rest, times, mains)[0]
             trial = _Track(self._placed(common, rest))
             energy = [self._step(trial, rest, times, mains, common=False) for _ in range(2 * PASSES)][-1]
             both = np.concatenate((self._chain.rows(a.pulses, times), self._chain.rows(b.pulses, times)))
-            weights = inner(orthonormal(both, mains), rest)
-            if energy > EDGED * float(np.vdot(weights, weights)):
+            if energy > EDGED * explained(both, mains, rest)[1]:
                 self._tracks = [trial, *(track for track in self._tracks if track is not a and track is not b)]
                 return
 
-    def _fitted(self, pulses: Pulses, clean: Array, times: Array, mains: Array) -> tuple[Array, Array]:
-        """Weights and orthonormal rows that fit one lamp to a block."""
-        rows = orthonormal(self._chain.rows(pulses, times), mains)
-        return inner(rows, clean), rows
+    def _light(self, pulses: Pulses, clean: Array, times: Array, mains: Array) -> tuple[Array, float, int]:
+        """Light (N,) of one lamp in a block, its energy, and the rank of its rows."""
+        return explained(self._chain.rows(pulses, times), mains, clean)
 
-    def _follow(self, clean: Array, residual: Array, mains: Array) -> None:
-        """Track all lamps through a block without coded lamps, the strongest first."""
-        times, noise = _centred(len(clean)), float(np.vdot(residual, residual)) / len(residual)
+    def _follow(self, clean: Array, noise: float, mains: Array) -> None:
+        """Track all lamps through a block without coded lamps, the oldest first; ``noise``: variance per sample."""
+        times = _centred(len(clean))
         for track in self._tracks:
             energy = self._settle(track, clean, times, mains)
-            weights, rows = self._fitted(track.pulses, clean, times, mains)
-            total = float(np.vdot(weights, weights))
+            light, total, rank = self._light(track.pulses, clean, times, mains)
             edged = energy > EDGED * total
             if not edged:
                 self._follow_line(track, clean, times, mains)
                 self._place_again(track, energy, clean, times, mains)
-            present = total > SIGNIFICANT * len(weights) * noise
+            present = total > SIGNIFICANT * rank * noise
             track.seen += present
             track.missed = 0 if present else track.missed + 1
             if present and track.seen % NAME_EVERY == 0:
                 self._name(track, clean, times, edged)
-            clean = clean - mixed(weights, rows)
+            clean = clean - light
         self._tracks = [track for track in self._tracks if track.missed < (ABSENT if track.seen > TRIED else 2)]
 
     def _name(self, track: _Track, clean: Array, times: Array, edged: bool) -> None:
@@ -229,14 +246,15 @@ class PwmLamps:
             return
         found = np.empty((2, NAMED_BY))
         harmonics(frequency, times, clean, found)
-        lines = found[0] + 1j * found[1]
-        many = order(lines) if frequency < 0.5 else 1
+        k = distinct(frequency, NAMED_BY, 1.0 / len(clean))
+        lines = (found[0] + 1j * found[1])[k - 1]
+        many = order(k, lines) if frequency < 0.5 else 1
         if many > 1:
             folded = abs(many * frequency - round(many * frequency))
             track.pulses, track.name = self._placed(folded, clean), None
             return
         noise = 4.0 * float(np.vdot(clean, clean) - 0.5 * len(clean) * (np.abs(lines) ** 2).sum()) / len(clean) ** 2
-        track.name = name = named(self._chain, frequency % 1.0, lines, self._rate, max(noise, 0.0))
+        track.name = name = named(self._chain, frequency % 1.0, k, lines, self._rate, max(noise, 0.0))
         if abs(name.frequency - frequency) > SAME_CELLS / len(clean):
             track.pulses = self._placed(name.frequency, clean)
 
@@ -244,13 +262,13 @@ class PwmLamps:
         """Track the frequency by the strongest line: an error of it is time times the quadrature of the line."""
         found = np.empty((2, NAMED_BY))
         harmonics(track.pulses.frequency, times, clean, found)
-        order = int(np.argmax((found**2).sum(axis=0))) + 1
-        phasor = np.exp(2j * np.pi * order * track.pulses.frequency * times)
+        strongest = int(np.argmax((found**2).sum(axis=0))) + 1
+        phasor = np.exp(2j * np.pi * strongest * track.pulses.frequency * times)
         ramp = times / times[-1]
         rows = np.array((phasor.real, phasor.imag, ramp * phasor.real, ramp * phasor.imag))
-        (c, s, t_c, t_s), _ = _least_squares(without(rows, mains), clean)
-        step = (t_c * s - t_s * c) / (2.0 * np.pi * times[-1] * order * max(c * c + s * s, 1e-12))
-        reach = SAME_CELLS / len(clean) / order
+        (c, s, t_c, t_s), _ = least_squares(rows, mains, clean)
+        step = (t_c * s - t_s * c) / (2.0 * np.pi * times[-1] * strongest * max(c * c + s * s, 1e-12))
+        reach = SAME_CELLS / len(clean) / strongest
         moved = track.pulses.frequency + min(max(float(step), -reach), reach)
         track.pulses = replace(track.pulses, frequency=moved)
 
@@ -310,7 +328,7 @@ class PwmLamps:
             rows = np.array((light, trains[RISE_SLOPE] - trains[FALL_SLOPE]))
         else:
             rows = np.array((light, trains[RISE_SLOPE], -trains[FALL_SLOPE], trains[DRIFT]))
-        weight, energy = _least_squares(without(rows, mains), clean)
+        weight, energy = least_squares(rows, mains, clean)
         moves = np.clip(weight[1:] / (abs(weight[0]) + 1e-12) * np.sign(weight[0]), -REACH, REACH) * pulses.frequency
         if common:
             track.pulses = replace(pulses, rise=pulses.rise + moves[0], fall=pulses.fall + moves[0])
@@ -350,14 +368,3 @@ def _cycle(harmonic: Complex) -> Array:
     spectrum = np.zeros(GRID // 2 + 1, np.complex128)
     spectrum[1 : len(harmonic) + 1] = harmonic
     return np.fft.irfft(spectrum, GRID)
-
-
-def _least_squares(rows: Array, row: Array) -> tuple[Array, float]:
-    """Weights of a few rows, and the energy that they explain."""
-    products, right = np.empty((len(rows), len(rows))), inner(rows, row)
-    gram(rows, len(rows), products)
-    products[np.diag_indices(len(rows))] *= 1.0 + 1e-9
-    products[np.diag_indices(len(rows))] += 1e-12
-    invert(products)
-    weights: Array = (products * right).sum(axis=1)
-    return weights, float((weights * right).sum())

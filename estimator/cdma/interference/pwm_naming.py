@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from estimator.cdma.interference.pwm_waveform import Chain, Complex
 from estimator.numerics.arrays import Array
+
+Index = npt.NDArray[np.int64]
 
 DUTIES: Final = np.arange(2, 99) * 0.01
 """Trial duty cycles."""
@@ -29,10 +32,18 @@ REPEATED: Final = 0.05
 """Relative amplitude below which a harmonic is absent."""
 
 
-def order(found: Complex) -> int:
+def distinct(frequency: float, count: int, cell: float) -> Index:
+    """Harmonics, of the first ``count``, that are not folded onto another or their mirror image; and the first one."""
+    cycles = frequency * np.arange(1, count + 1)
+    lines = np.abs(cycles - np.round(cycles))
+    shared = np.tril(np.abs(lines[:, None] - lines) < cell, -1).any(axis=1) | (np.abs(lines - 0.25) > 0.25 - 0.5 * cell)
+    shared[0] = False
+    return np.flatnonzero(~shared) + 1
+
+
+def order(harmonics: Index, found: Complex) -> int:
     """Greatest common divisor of the harmonics that are present: above 1, the fundamental is that multiple."""
-    present = np.flatnonzero(np.abs(found) > REPEATED * np.abs(found).max()) + 1
-    return int(np.gcd.reduce(present))
+    return int(np.gcd.reduce(harmonics[np.abs(found) > REPEATED * np.abs(found).max()]))
 
 
 @dataclass(frozen=True)
@@ -44,13 +55,14 @@ class Named:
     other: float | None = None
 
 
-def named(chain: Chain, frequency: float, found: Complex, rate_hz: float, noise: float) -> Named:
+def named(chain: Chain, frequency: float, k: Index, found: Complex, rate_hz: float, noise: float) -> Named:
     """Frequency and swing of the light that has these harmonics.
 
     Args:
         chain: receiver.
         frequency: apparent one, or any that is folded to it.
-        found: complex amplitudes of its harmonics.
+        k: harmonics, from the first one on.
+        found: their complex amplitudes.
         rate_hz: samples per second.
         noise: variance of each amplitude.
     """
@@ -60,7 +72,7 @@ def named(chain: Chain, frequency: float, found: Complex, rate_hz: float, noise:
         for cycles in range(int(highest) + 2)
         for sign, seen in ((1.0, found), (-1.0, np.conj(found)))
         if 0.0 < (trial := cycles + sign * frequency) <= highest
-        for misfit, swing in (_misfit(chain, trial, seen),)
+        for misfit, swing in (_misfit(chain, trial, k, seen),)
     )
     likely = [trial for trial in trials if trial[0] <= trials[0][0] / LIKELIER]
     first = min(likely, key=lambda trial: trial[1])
@@ -68,9 +80,8 @@ def named(chain: Chain, frequency: float, found: Complex, rate_hz: float, noise:
     return Named(first[1], first[2], alike[0][1] if alike else None)
 
 
-def _misfit(chain: Chain, frequency: float, found: Complex) -> tuple[float, float]:
-    """Energy of the harmonics that a rectangle of this frequency leaves, at its best duty cycle, and its swing."""
-    k = np.arange(1.0, len(found) + 1.0)
+def _misfit(chain: Chain, frequency: float, k: Index, found: Complex) -> tuple[float, float]:
+    """Energy of harmonics ``k`` that a rectangle of this frequency leaves, at its best duty cycle, and its swing."""
     gain = chain.gain(frequency * k) / (np.pi * k)
     model = -1j * gain * (1.0 - np.exp(-2j * np.pi * k * DUTIES[:, None]))
     turn = np.exp(1j * k * (np.angle(found[0]) - np.angle(model[:, :1])))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from estimator.cdma.air_interface import Profile
 from estimator.cdma.chip_pulse import step_modes
-from estimator.cdma.correlation_kernels import gram, inner, mixed, tones
+from estimator.cdma.correlation_kernels import combine, gram, inner, invert, mixed, tones
 from estimator.cdma.interference.pwm_kernels import TRAIN_ROWS, trains, triangular
 from estimator.numerics.arrays import Array
 
@@ -22,6 +22,9 @@ Complex = npt.NDArray[np.complex128]
 
 HARMONICS: Final = 8
 """Harmonics with free amplitude and phase: for lamps whose light is no sharp rectangle, and above half the rate."""
+
+ROUNDED: Final = 1e-8
+"""Share of a row's energy beyond others that may be rounding."""
 
 
 @dataclass(frozen=True)
@@ -70,21 +73,48 @@ class Chain:
         return out
 
 
-def without(rows: Array, known: Array) -> Array:
-    """Rows without the span of the orthonormal rows ``known``, in place."""
-    for row in rows:
-        row -= mixed(inner(known, row), known)
-    return rows
+def least_squares(rows: Array, known: Array, row: Array) -> tuple[Array, float]:
+    """Weights of a few rows beside the orthonormal rows ``known``, and the energy that they explain.
+
+    ``row`` contains nothing of ``known``.
+    """
+    products, right, inside = np.empty((len(rows), len(rows))), inner(rows, row), np.empty((len(rows), len(known)))
+    gram(rows, len(rows), products)
+    for part, one in zip(inside, rows, strict=True):
+        part[:] = inner(known, one)
+    products -= np.einsum("ik,jk->ij", inside, inside)
+    products[np.diag_indices(len(rows))] *= 1.0 + 1e-9
+    products[np.diag_indices(len(rows))] += 1e-12
+    invert(products)
+    weights: Array = (products * right).sum(axis=1)
+    return weights, float((weights * right).sum())
+
+
+def _beyond(rows: Array, known: Array) -> tuple[Array, Array]:
+    """Rows and ``known`` in one stack, and weights that make of it orthonormal rows beyond ``known``."""
+    stack, n = np.concatenate((rows, known)), len(rows)
+    products = np.empty((len(stack), n))
+    gram(stack, n, products)
+    inside = products[n:]
+    own = products[:n] - np.einsum("ki,kj->ij", inside, inside)
+    left = own.diagonal()  # each row's energy beyond `known`: that of an edge train is mostly its mean
+    scale = np.where(left > ROUNDED * products[:n].diagonal(), 1.0 / np.sqrt(np.maximum(left, 1e-30)), 0.0)
+    own *= scale * scale[:, None]
+    weights = np.empty_like(own)
+    weights = weights[: triangular(own, weights)] * scale
+    return stack, np.concatenate((weights, -np.einsum("ci,ki->ck", weights, inside)), axis=1)
 
 
 def orthonormal(rows: Array, known: Array) -> Array:
-    """Orthonormal rows (count, N) of the same span beyond that of the orthonormal rows ``known``; overwrites rows."""
-    rows *= (1.0 / np.sqrt(np.maximum(np.einsum("ij,ij->i", rows, rows), 1e-24)))[:, None]
-    products = np.empty((len(rows), len(rows)))
-    gram(without(rows, known), len(rows), products)
-    weights = np.empty_like(products)
-    count = triangular(products, weights)
-    out = np.empty((count, rows.shape[1]))
-    for row, weight in zip(out, weights, strict=False):
-        row[:] = mixed(weight, rows)
+    """Orthonormal rows (count, N) of the span of ``rows`` beyond that of the orthonormal rows ``known``."""
+    stack, weights = _beyond(rows, known)
+    out = np.empty((len(weights), rows.shape[1]))
+    combine(weights, stack, out)
     return out
+
+
+def explained(rows: Array, known: Array, row: Array) -> tuple[Array, float, int]:
+    """Part (N,) of a row that lies in the span of ``rows`` beyond ``known``, its energy, and the rank of that span."""
+    stack, weights = _beyond(rows, known)
+    found = inner(weights, inner(stack, row))
+    return mixed((found[:, None] * weights).sum(axis=0), stack), float((found * found).sum()), len(weights)

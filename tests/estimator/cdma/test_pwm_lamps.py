@@ -9,7 +9,7 @@ from estimator.cdma.air_interface import PROFILE_A
 from estimator.cdma.epoch import BlockFlag
 from estimator.cdma.interference.pwm_detection import fundamental
 from estimator.cdma.interference.pwm_kernels import FALL, RISE
-from estimator.cdma.interference.pwm_waveform import Chain, Pulses, orthonormal
+from estimator.cdma.interference.pwm_waveform import Chain, Pulses, explained, orthonormal
 from tests.estimator.cdma_scene import SAMPLES, Run, ceiling, currents
 from tools.sim.light.transmitter import PwmLamp
 from tools.sim.light.waveform import Ambient
@@ -41,6 +41,14 @@ def test_a_dimmed_lamp_costs_no_coded_lamp(hertz: float, swing_a: float) -> None
     (named,) = epoch.pwm
     assert named.hertz == pytest.approx(hertz, rel=1e-3)
     assert named.swing_a == pytest.approx(swing_a, rel=0.15)
+    assert len(run.decoder.background.pwm) == 1
+
+
+@pytest.mark.parametrize("duty", [0.1, 0.3, 0.9])
+def test_a_frequency_above_the_sample_rate_is_named(duty: float) -> None:
+    """At nine eighths of the sample rate all harmonics fall on four lines."""
+    (named,) = dimmed(25000, PwmLamp(25000.0, 2.0 * MICRO, duty, 0.37)).settle(60).pwm
+    assert named.hertz == pytest.approx(25000.0, rel=1e-3)
 
 
 @pytest.mark.parametrize("duty", [0.05, 0.2, 0.8])
@@ -100,7 +108,7 @@ def test_nothing_is_named_where_nothing_is_dimmed() -> None:
     assert epoch.block == BlockFlag.NONE
 
 
-@pytest.mark.parametrize("hertz", [210.0, 1000.0, 4000.0])
+@pytest.mark.parametrize("hertz", [210.0, 1000.0, 3000.0, 5000.0])
 def test_the_waveform_is_that_of_the_receiver(hertz: float) -> None:
     """The simulator steps through the same chain edge by edge, and shares no code with the closed form."""
     world = ceiling(1, np.array([]))
@@ -117,6 +125,9 @@ def test_the_waveform_is_that_of_the_receiver(hertz: float) -> None:
     weight = float(light @ seen) / float(light @ light)
     assert weight == pytest.approx(20.0 * MICRO / PROFILE_A.front_end.lsb_a, rel=2e-3)
     assert np.std(seen - weight * light) < 1.0
+    mean = np.full((1, SAMPLES), SAMPLES**-0.5)
+    spanned = explained(Chain(PROFILE_A).rows(Pulses(hertz / RATE, rise, rise - 0.3), times), mean, seen)[0]
+    assert np.std(seen - spanned) < 0.6  # noise of the converter: no harmonic is left out
 
 
 def test_derivatives_of_the_edge_trains() -> None:
