@@ -110,12 +110,12 @@ class Clocks:
 
     def predict(self, dt: float) -> None:
         """Advance by ``dt`` seconds."""
-        chips = dt * self._chip_rate
-        step = np.array([[1.0, chips], [0.0, 1.0]])
-        self.state = step @ self.state
-        self.cov = step @ self.cov @ step.T
-        self.cov[0, 0] += PHASE_WALK**2 * dt
-        self.cov[1, 1] += DRIFT_WALK**2 * dt
+        chips, p = dt * self._chip_rate, self.cov
+        self.state[0] += chips * self.state[1]
+        p[0, 0] += 2 * chips * p[0, 1] + chips**2 * p[1, 1] + PHASE_WALK**2 * dt
+        p[0, 1] += chips * p[1, 1]
+        p[1, 0] = p[0, 1]
+        p[1, 1] += DRIFT_WALK**2 * dt
         self.clock_var += CLOCK_WALK**2 * dt
 
     def update(self, lag: float, excess_s: float, fit: Fit) -> None:

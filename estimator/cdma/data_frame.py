@@ -6,6 +6,7 @@ coded information T = (x, y, i), with height and power. The layout is in docs/ai
 
 from __future__ import annotations
 
+from binascii import crc_hqx
 from dataclasses import dataclass
 from typing import Final
 
@@ -51,10 +52,9 @@ class LampFrame:
 def crc16(bits: int, width: int) -> int:
     """CRC-16/CCITT-FALSE (polynomial 0x1021, starts at 0xFFFF, no reflection, no final inversion) of a bit string."""
     register = 0xFFFF
-    for at in range(width - 1, -1, -1):
-        carry = register >> 15 ^ bits >> at & 1
-        register = register << 1 & 0xFFFF ^ (0x1021 if carry else 0)
-    return register
+    for _ in range(-width % 8):  # so that the zero bits that fill the first byte lead to the start value
+        register = (register ^ 0x1021) >> 1 | 0x8000 if register & 1 else register >> 1
+    return crc_hqx(bits.to_bytes((width + 7) // 8, "big"), register)
 
 
 def _checksum(payload: int, code: int) -> int:

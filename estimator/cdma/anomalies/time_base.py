@@ -66,8 +66,8 @@ class TimeBase:
         """Samples are evenly spaced."""
         self._shift: Array = np.zeros(0)
         self._seen: list[tuple[Array, Array]] = []
-        self._pauses: list[tuple[int, float]] = []
-        self._late = self._unlearned = self._held = 0
+        self._pauses: list[tuple[int, int, float]] = []  # block, sample, length
+        self._late = self._unlearned = self._held = self._blocks = 0
         self.doubt = 0.0
         self._even = self._known = False
 
@@ -97,17 +97,20 @@ class TimeBase:
 
     def on_stamps(self, late: bool) -> None:
         """Count a block; ``late``: its time stamps are farther apart than its samples account for."""
+        self._blocks += 1
         self._late = self._late + 1 if late else 0
         self._held = HELD if self._known or self._late >= LATE else max(self._held - 1, 0)
 
     def on_pause(self, at: int, chips: float) -> None:
         """Count a single pause that has been found before sample ``at``, as long as ``chips``."""
-        if self._pauses and abs(self._pauses[-1][0] - at) > SAME_PLACE:
-            self._pauses = []
-        self._pauses.append((at, chips))
+        if self._pauses:
+            block, place, _ = self._pauses[-1]
+            if block < self._blocks - 1 or abs(place - at) > SAME_PLACE:
+                self._pauses = []
+        self._pauses.append((self._blocks, at, chips))
         if len(self._pauses) < REPEATED:
             return
-        places, lengths = zip(*self._pauses, strict=True)
+        _, places, lengths = zip(*self._pauses, strict=True)
         step = np.zeros(len(self._shift))
         step[int(np.median(places)) :] = float(np.median(lengths))
         self._add(step)

@@ -82,7 +82,7 @@ def named(chain: Chain, frequency: float, k: Index, found: Complex, rate_hz: flo
 
 def _misfit(chain: Chain, frequency: float, k: Index, found: Complex) -> tuple[float, float]:
     """Energy of harmonics ``k`` that a rectangle of this frequency leaves, at its best duty cycle, and its swing."""
-    gain = chain.gain(frequency * k) / (np.pi * k)
+    gain = chain.gain(frequency * k.astype(np.float64)) / (np.pi * k)
     model = -1j * gain * (1.0 - np.exp(-2j * np.pi * k * DUTIES[:, None]))
     turn = np.exp(1j * k * (np.angle(found[0]) - np.angle(model[:, :1])))
     model = model * turn

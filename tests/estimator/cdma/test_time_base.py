@@ -55,12 +55,14 @@ def test_an_even_bus_is_not_flagged() -> None:
     assert all(not epoch.block & BlockFlag.UNEVEN for _, epoch in run.blocks(200))
 
 
-def test_single_stalled_blocks_are_no_pattern() -> None:
+@pytest.mark.parametrize("places", [(5, 1100), (500, 501)])
+def test_single_stalled_blocks_are_no_pattern(places: tuple[int, int]) -> None:
+    """Neither at any place nor at one."""
     run = Run(ceiling(43))
     run.settle(30)
     rng = np.random.default_rng(4)
     for _ in range(30):
-        run.block(((int(rng.integers(5, 1100)), 60e-6),))
+        run.block(((int(rng.integers(*places)), 60e-6),))
         for _, epoch in run.blocks(3):
             assert not epoch.block & BlockFlag.UNEVEN
 
