@@ -29,6 +29,12 @@ changes by 0.01 Hz/s is followed to 0.002 Hz.
 JUMP: Final = 5e-4
 """Limit of the relative frequency error of one block: a larger one is a disturbance, not the grid."""
 
+INSISTENT: Final = 3
+"""Blocks in a row with larger errors of one sign: the frequency has been chosen from a disturbed or a dark block."""
+
+FLICKER: Final = 25.0
+"""Energy of the fundamental over that of as much noise, from which there is flicker to track."""
+
 RIDGE: Final = 1e-9
 """Relative and absolute regularisation of rows that masked samples make alike."""
 
@@ -58,6 +64,11 @@ def orthonormal(rows: Array) -> tuple[Array, Array]:
     return out, lower
 
 
+def _power(c: list[float]) -> float:
+    """Power of the fundamental, by the coefficients of the basis."""
+    return c[_COS] ** 2 + c[_SIN] ** 2 + c[_T_COS] ** 2 + c[_T_SIN] ** 2
+
+
 class Mains:
     """Frequency tracker of the flicker, with the orthonormal basis for blocks of one size."""
 
@@ -67,6 +78,7 @@ class Mains:
         self._harmonics = harmonics
         self._frequency = 0.0
         self._nominal = 0.0
+        self._beyond = 0  # blocks in a row with errors beyond `JUMP`, with their sign
         self._built = (0, 0.0)
         self._q: Array = np.empty((0, 0))
         self._upper: Array = np.empty((0, 0))
@@ -84,7 +96,9 @@ class Mains:
 
     def learn(self, y: Array) -> None:
         """Track the flicker of an undisturbed block, for the next one."""
-        self._follow(self._coefficients(self.rows(y), y), self._built[1], GAIN, JUMP, len(y))
+        inside = inner(self.rows(y), y)
+        rest = float(np.vdot(y, y) - np.vdot(inside, inside))
+        self._follow(inner(self._upper, inside).tolist(), self._built[1], rest, len(y))
 
     def learn_masked(self, y: Array, mask: Array, more: Array) -> None:
         """The same for a block with masked samples; ``more``: (M, N) rows of other light in it."""
@@ -95,7 +109,10 @@ class Mains:
         products[np.diag_indices(len(rows))] *= 1.0 + RIDGE
         products[np.diag_indices(len(rows))] += RIDGE
         invert(products)
-        self._follow(inner(products, inner(rows, y)), self._frequency, GAIN, JUMP, len(y))
+        right = inner(rows, y)
+        coefficients = inner(products, right)
+        rest = float(np.vdot(y, y) - np.vdot(coefficients, right))
+        self._follow(coefficients.tolist(), self._frequency, rest, len(y))
 
     def masked(self, times: Array, mask: Array) -> Array:
         """Orthonormal rows for a block with masked samples or a corrected time base; ``times`` in samples."""
@@ -115,19 +132,32 @@ class Mains:
             self._built = (size, self._frequency)
         return self._q
 
-    def _coefficients(self, q: Array, y: Array) -> Array:
-        """Coefficients of the basis, from the products of its orthonormal rows."""
-        return inner(self._upper, inner(q, y))
+    def _error(self, c: list[float], built: float, size: int) -> float:
+        """Error of the frequency to first order: it looks like t times the quadrature of the sinusoid ``built``.
 
-    def _follow(self, coefficients: Array, built: float, gain: float, jump: float, size: int) -> None:
-        """First-order frequency correction: a frequency error looks like t times the quadrature of the sinusoid."""
-        c = coefficients.tolist()
-        power = c[_COS] ** 2 + c[_SIN] ** 2 + c[_T_COS] ** 2 + c[_T_SIN] ** 2
-        if power > 0.0:
-            found = built + (c[_T_COS] * c[_SIN] - c[_T_SIN] * c[_COS]) / (np.pi * (size - 1) * power)
-            step = min(max(found - self._frequency, -jump * self._nominal), jump * self._nominal)
-            followed = self._frequency + gain * step
-            self._frequency = min(max(followed, (1 - PULL) * self._nominal), (1 + PULL) * self._nominal)
+        ``c``: coefficients of the basis.
+        """
+        power = max(_power(c), 1e-30)
+        beat = (c[_T_COS] * c[_SIN] - c[_T_SIN] * c[_COS]) / (np.pi * (size - 1) * power)
+        return built + float(beat) - self._frequency
+
+    def _follow(self, c: list[float], built: float, rest: float, size: int) -> None:
+        """Correct the frequency by one block; ``rest``: energy of the block that the basis does not explain."""
+        if 0.5 * size**2 * _power(c) < FLICKER * rest:
+            return
+        error, limit = self._error(c, built, size), JUMP * self._nominal
+        sign = 1 if error > 0.0 else -1
+        self._beyond = (self._beyond + sign if self._beyond * sign > 0 else sign) if abs(error) > limit else 0
+        if abs(self._beyond) < INSISTENT:
+            self._correct(GAIN * min(max(error, -limit), limit))
+        elif not self._correct(error):
+            self._frequency = 0.0  # the other grid: chosen anew from the next block
+
+    def _correct(self, step: float) -> bool:
+        """Change the frequency, within `PULL` of its nominal value; returns whether it stays within."""
+        moved, reach = self._frequency + step, PULL * self._nominal
+        self._frequency = min(max(moved, self._nominal - reach), self._nominal + reach)
+        return self._frequency == moved
 
     def _choose(self, y: Array) -> None:
         """Choose 50 or 60 Hz grid, and its frequency to first order, from the first block."""
@@ -135,7 +165,8 @@ class Mains:
         for hertz in FUNDAMENTALS_HZ:
             self._frequency = self._nominal = hertz / self._rate
             for _ in range(3):
-                self._follow(self._coefficients(self._fresh(len(y)), y), self._built[1], 1.0, PULL, len(y))
+                inside = inner(self._fresh(len(y)), y)
+                self._correct(self._error(inner(self._upper, inside).tolist(), self._built[1], len(y)))
             left = inner(self._fresh(len(y)), y)
             tried.append((float(y @ y - left @ left), self._frequency, self._nominal))
         _, self._frequency, self._nominal = min(tried)

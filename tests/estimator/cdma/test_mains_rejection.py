@@ -51,6 +51,27 @@ def test_a_torn_block_moves_it_little() -> None:
     assert mains.hertz == pytest.approx(100.0, abs=0.03)
 
 
+def test_a_torn_first_block_is_soon_forgotten() -> None:
+    ceiling, mains = Ceiling([], Ambient()), Mains(RATE, 10)
+    mains.learn(ceiling.block(0.0, 1111, ((500, 700e-6),)).words - 2048.0)
+    for k in range(1, 10):
+        mains.learn(mains_block(ceiling, 0.0507 * k))
+    assert mains.hertz == pytest.approx(100.0, abs=0.01)
+
+
+@pytest.mark.parametrize("hertz", [100.0, 120.0])
+def test_either_grid_is_found_after_darkness(hertz: float) -> None:
+    """Noise alone decides for one of the two."""
+    for seed in range(4):
+        ceiling, mains = Ceiling([], Ambient(flicker_a=0.0), seed=seed), Mains(RATE, 10)
+        for k in range(3):
+            mains.learn(mains_block(ceiling, 0.0507 * k))
+        ceiling.ambient = Ambient(mains_hz=hertz)
+        for k in range(10, 20):
+            mains.learn(mains_block(ceiling, 0.0507 * k))
+        assert mains.hertz == pytest.approx(hertz, abs=0.01)
+
+
 def mains_block(ceiling: Ceiling, t: float) -> np.ndarray:
     return np.asarray(ceiling.block(t, 1111).words - 2048.0)
 
