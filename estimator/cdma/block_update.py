@@ -76,7 +76,15 @@ _MENDED, _NOISY, _CLIPPED = int(BlockFlag.MENDED), int(BlockFlag.NOISY), int(Blo
 
 
 class Decoder:
-    """State of the decoder of one photodiode; created by :func:`estimator.cdma.decoder.new_decoder`."""
+    """State of the decoder of one photodiode; created by :func:`estimator.cdma.decoder.new_decoder`.
+
+    Attributes:
+        noise, usual_noise: residual of the last block, rms, and its usual level beside confirmed lamps; ADC steps.
+        offered: block for the next sweep of the search. found: outcome of the last sweep, not yet taken.
+        barren: sweeps since a lamp was last confirmed. past, stalled, odd: blocks in a row with an earlier time, with a
+            stall, and noisy or stalled.
+        untested, interval: blocks since the last test for twins, and without a candidate until the next one.
+    """
 
     def __init__(self, profile: Profile, clock_ppm: float | None, hung: Collection[int] = ()) -> None:
         """``clock_ppm``: stored error of the sample clock, or None; ``hung``: codes of lamps in the building."""
@@ -158,7 +166,7 @@ def follow(decoder: Decoder, block: SampleBlock, sampled: Sampled) -> tuple[Bloc
         if solved.fit.clearest > CLEAR:  # otherwise no lamp is received, and the delay found is chance
             clocks.update(solved.lag + solved.fit.lag - float(clocks.state[0]), excess, solved.fit)
             tracks.learn_phases(solved.slots, solved.fit)
-        _live_and_die(decoder, solved, suspicious=noisy)
+        _update_life_cycle(decoder, solved, suspicious=noisy)
     if not found & (_STALLED | _MENDED):
         decoder.background.learn_beyond(solved.fit)
         decoder.colour.learn(solved.fit.residual)
@@ -260,7 +268,7 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
     confirmed = len(tracks.confirmed)
     newcomers = confirmed < len(slots)
     solved = _Solved(sampled, slots, prior, lag, fit, newcomers)
-    _listen(decoder, fit, confirmed > 0)
+    _track_noise(decoder, fit, confirmed > 0)
     if confirmed:
         decoder.time_base.learn(fit.mixed_slope, fit.residual, fit.noise_var)
     if verdict.good or not confirmed:
@@ -278,7 +286,7 @@ def _solve(decoder: Decoder, sampled: Sampled, lag: float) -> tuple[BlockFlag, _
     return BlockFlag.MENDED, _Solved(mended.block, slots, mended.prior, lag + mended.lag, mended.fit, newcomers)
 
 
-def _listen(decoder: Decoder, fit: Fit, confirmed: bool) -> None:
+def _track_noise(decoder: Decoder, fit: Fit, confirmed: bool) -> None:
     """Track the usual noise beside confirmed lamps: a fall quickly, a rise slowly: single blocks do not count."""
     noise = float(np.sqrt(fit.noise_var))
     decoder.noise = noise
@@ -310,7 +318,7 @@ def _read(decoder: Decoder, solved: _Solved) -> None:
         tracks.frames[slot] = frame
 
 
-def _live_and_die(decoder: Decoder, solved: _Solved, suspicious: bool) -> None:
+def _update_life_cycle(decoder: Decoder, solved: _Solved, suspicious: bool) -> None:
     """Correct side-lobe tracking, confirm candidates, and drop lost lamps.
 
     Candidates are tested for side lobes; in suspicious blocks so are all lamps. A candidate must be stronger than the

@@ -143,7 +143,7 @@ def solve_rows(stack: F8, index: I8, count: int, mains: int, found: F8, unit_var
 
 
 @kernel("void(i8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1], f8, f8[:,:,::1])")
-def tell_signs(index: I8, pieces: F8, bounds: I8, earlier: F8, long: float, out: F8) -> None:
+def decide_signs(index: I8, pieces: F8, bounds: I8, earlier: F8, long: float, out: F8) -> None:
     """Data sign of each lamp in each code period, where it is certain.
 
     A sign is certain by the last block's soft bit, by the length of the piece, or by its significance.

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from estimator.cdma.code_period_kernels import TAIL_CHIPS, compare_shifts, cut, lay_out, solve_rows, tell_signs
+from estimator.cdma.code_period_kernels import TAIL_CHIPS, compare_shifts, cut, decide_signs, lay_out, solve_rows
 from estimator.cdma.correlation_kernels import columns, mixed
 from estimator.cdma.joint_fit_kernels import REACH
 from estimator.cdma.sample_block import Fit, Prior, Sampled, rows_of
@@ -96,12 +96,14 @@ def data_signs(block: Sampled, prior: Prior, tables: Array) -> Signs:
     pieces = solve_pieces(block, prior, tables)
     whole = prior.chips.shape[1] * len(block.x) / float(block.x[-1] - block.x[0])
     found = rows_of(pieces.found[:-2], pieces.noise_var * pieces.unit_var)
-    told = np.empty((3, len(prior.phase), pieces.bounds.shape[1] - 1))
-    tell_signs(pieces.index, found, pieces.bounds, rows_of(prior.bit_sum, prior.bit_weight), LONG_PIECE * whole, told)
+    decided = np.empty((3, len(prior.phase), pieces.bounds.shape[1] - 1))
+    decide_signs(
+        pieces.index, found, pieces.bounds, rows_of(prior.bit_sum, prior.bit_weight), LONG_PIECE * whole, decided
+    )
     reach = REACH / float(block.x[-1])
     lag, clock = pieces.found[-2:].tolist()
     lag, clock = min(max(lag, -REACH), REACH), min(max(clock, -reach), reach)
-    return Signs(told[2], told[0], told[1], lag, clock, pieces.noise_var)
+    return Signs(decided[2], decided[0], decided[1], lag, clock, pieces.noise_var)
 
 
 SHIFTS: Final = np.array([0.0, -0.5, 0.5, -1.0, 1.0])

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.cdma.epoch import BlockFlag, LightEpoch, LinkFlag
+from estimator.cdma.epoch import BlockFlag, LightEpoch, LinkFlag, PwmLight
 from tools.bench.cdma import NADIR_A, Drive, ceiling, lamps
 from tools.sim.light.transmitter import PwmLamp
 from tools.sim.light.waveform import Ceiling
@@ -61,12 +61,18 @@ def _beside(hertz: float, swing_a: float, duty: float) -> str:
             errors.append(row[7])
         z += _normalised(world, block.truth_a, epoch)
     eighth = 100.0 * float(np.sqrt(np.nanmean(np.square(errors)))) if errors else np.nan
-    names = ", ".join(f"{lamp.hertz:.1f} Hz, {lamp.swing_a * 1e6:.2f} uA" for lamp in epoch.pwm) or "-"
+    names = ", ".join(_name(lamp) for lamp in epoch.pwm) or "-"
     more = f"; {false} false codes" * (false > 0) + f"; {flagged} of {COUNTED} blocks flagged" * (flagged > 0)
     sigmas = float(np.sqrt(np.mean(np.square(z)))) if z else np.nan
     return (
         f"| {hertz:g} Hz | {swing_a * 1e6:g} uA | {duty:g} | {fewest} | {eighth:.2f} % | {sigmas:.2f} | {names}{more} |"
     )
+
+
+def _name(lamp: PwmLight) -> str:
+    """Frequencies and swing as they are reported."""
+    other = "" if lamp.other_hertz is None else f" or {lamp.other_hertz:.1f} Hz"
+    return f"{lamp.hertz:.1f} Hz{other}, {lamp.swing_a * 1e6:.2f} uA"
 
 
 def _normalised(world: Ceiling, truth_a: np.ndarray, epoch: LightEpoch) -> list[float]:

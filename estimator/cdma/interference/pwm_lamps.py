@@ -56,7 +56,7 @@ NAME_EVERY: Final = 16
 """Blocks with a lamp between two looks at its true frequency."""
 
 NAMED_BY: Final = 6
-"""Harmonics that tell it."""
+"""Harmonics that show it."""
 
 SEEN_BY_EDGES: Final = 0.1
 """Frequency (cycles per sample) below which edges show that it is not folded."""

@@ -17,7 +17,7 @@ DUTIES: Final = np.arange(2, 99) * 0.01
 """Trial duty cycles."""
 
 SCARCE: Final = 0.02
-"""Cost of a duty cycle other than one half, as a share of the light: one line alone tells no duty cycle."""
+"""Cost of a duty cycle other than one half, as a share of the light: one line alone shows no duty cycle."""
 
 LIKELIER: Final = 0.5
 """Misfit, as a share of that of another frequency, above which the lower of the two is believed."""

@@ -173,7 +173,7 @@ def test_signs_are_told_where_they_are_certain(seed: int) -> None:
     at = np.nonzero(touched)
     pieces = np.stack([rng.normal(scale=10.0, size=len(at[0])), rng.choice([0.2, 2.0, 30.0], size=len(at[0]))])
     earlier, out = np.stack([rng.normal(scale=5.0, size=lamps), np.ones(lamps)]), np.empty((3, lamps, periods))
-    code_period_kernels.tell_signs(np.ascontiguousarray(np.stack([*at, *at])), pieces, bounds, earlier, 20.0, out)
+    code_period_kernels.decide_signs(np.ascontiguousarray(np.stack([*at, *at])), pieces, bounds, earlier, 20.0, out)
     soft, variance = np.zeros((lamps, periods)), np.full((lamps, periods), np.inf)
     soft[at], variance[at] = pieces
     np.testing.assert_array_equal(out[0], soft)
