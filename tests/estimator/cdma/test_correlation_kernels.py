@@ -122,6 +122,9 @@ def test_inner_and_mixed_are_products_with_a_vector(rows: int) -> None:
     data, row, weights = rng.normal(size=(rows, 23)), rng.normal(size=23), rng.normal(size=rows)
     np.testing.assert_allclose(correlation_kernels.inner(data, row), data @ row, atol=1e-12)
     np.testing.assert_allclose(correlation_kernels.mixed(weights, data), weights @ data, atol=1e-12)
+    several, out = np.random.default_rng(rows).normal(size=(rows, rows)), np.empty_like(data)
+    correlation_kernels.combine(several, data, out)
+    np.testing.assert_allclose(out, several @ data, atol=1e-12)
 
 
 def test_cut_puts_each_period_into_a_row_of_its_own() -> None:

@@ -90,8 +90,10 @@ def test_no_flicker_at_all() -> None:
     y = mains_block(Ceiling([], Ambient(flicker_a=0.0)), 0.0)
     mains = Mains(RATE, 10)
     assert left_over(mains, y) < 1.1 * NOISE_LSB
-    mains.learn(np.zeros(1111))
-    assert 97.0 <= mains.hertz <= 123.6
+    before = mains.hertz
+    for row in (y, np.zeros(1111)):
+        mains.learn(row)
+    assert mains.hertz == before
 
 
 def test_orthonormal_gives_the_factor_too() -> None:
