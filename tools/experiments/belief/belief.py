@@ -1,7 +1,7 @@
-"""Belief in the place: never lost without a reason, never sure without one; every row with its limit.
+"""Belief in the place: never lost without a reason, never sure without one. Every row with its limit.
 
-``python -m tools.experiments --only belief [--rows clean,perturbed,...] [--trials N]``. Real logs are found through
-LUMILOOP_DATA; rows on them are left out without it. Replays are kept in ``out/belief/<code>`` and not made again.
+``--rows clean,perturbed`` makes only these, ``--trials N`` so many seeds of each. Real logs are found through
+LUMILOOP_DATA. What has been made is kept in ``out/belief/<code>`` and not made again.
 """
 
 from __future__ import annotations
@@ -29,24 +29,20 @@ def run(quick: bool, work: Work) -> Report:
     """All rows, or those of ``work.rows``; with ``quick`` the clean drives alone.
 
     Raises:
-        ValueError: there is no row of one of these names.
-        Skipped: none of them can run here.
+        Skipped: there is no row of one of these names, or none that can be made here.
     """
-    names = work.rows or (("clean",) if quick else tuple(ROWS))
-    if unknown := set(names) - set(ROWS):
-        raise ValueError(f"no such row: {', '.join(sorted(unknown))}; there are {', '.join(ROWS)}")
     parts: list[Report] = []
-    notes: list[str] = []
-    for name in names:
+    for name in work.rows or (("clean",) if quick else tuple(ROWS)):
+        if name not in ROWS:
+            raise Skipped(f"there is no row {name}; there are {', '.join(ROWS)}")
         try:
             parts.append(ROWS[name](work))
         except Skipped as reason:
-            notes.append(f"row {name} is left out: {reason}")
-    if not parts:
-        raise Skipped("; ".join(notes))
-    return Report(
-        tuple(figure for part in parts for figure in part.figures),
-        tuple(table for part in parts for table in part.tables),
-        seeds=tuple(sorted({seed for part in parts for seed in part.seeds})),
-        notes=(*(note for part in parts for note in part.notes), *notes),
+            parts.append(Report(notes=(f"row {name} is left out: {reason}",)))
+    if not any(part.figures for part in parts):
+        raise Skipped("; ".join(note for part in parts for note in part.notes))
+    figures, tables, notes = (
+        [one for part in parts for one in getattr(part, what)] for what in ("figures", "tables", "notes")
     )
+    seeds = sorted({seed for part in parts for seed in part.seeds})
+    return Report(tuple(figures), tuple(tables), seeds=tuple(seeds), notes=tuple(notes))

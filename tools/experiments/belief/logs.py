@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import gzip
-import math
 import os
 import tempfile
 from collections import Counter
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Final
 
@@ -20,9 +19,9 @@ from tools.experiments.support.report import Skipped
 from tools.sim.building.world import Array
 
 VARIABLE: Final = "LUMILOOP_DATA"
-LASER_LINES: Final = ("FLASER", "ROBOTLASER1")
 UNRETURNED: Final = 0.98
-"""Ranges above this share of the largest in a log are no returns."""
+"""Ranges above this share of the largest that the log names are no returns."""
+SICK, URG, RPLIDAR, NEATO = "SICK LMS", "URG-04LX", "RPLIDAR A1", "Neato LDS"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,56 +32,46 @@ class Log:
     lidar: str
     wheels: bool = True
 
-    @property
-    def urg(self) -> bool:
-        """Whether the lidar is a URG-04LX, which sees four metres."""
-        return self.lidar == "URG-04LX"
-
 
 LOGS: Final = {
-    "intel": Log("intel/intel.clf.gz", "SICK LMS"),
-    "aces": Log("aces/aces.clf.gz", "SICK LMS"),
-    "exp1": Log("urg04lx/exp1.dat.gz", "URG-04LX"),
-    "exp2": Log("urg04lx/exp2.dat.gz", "URG-04LX"),
-    "test_lab": Log("urg04lx/test_lab.clf.gz", "URG-04LX"),
-    "freiburg-101": Log("keyscans/freiburg-101.clf.gz", "SICK LMS, key scans"),
-    "fhw": Log("keyscans/fhw.clf.gz", "SICK LMS, key scans"),
-    "wean2": Log("more/wean2.clf.gz", "SICK LMS"),
-    "wean4": Log("more/wean4.clf.gz", "SICK LMS"),
-    "dp-loop5": Log("more/dp-loop5.clf.gz", "SICK LMS"),
-    "slambot-24JUL14_14m": Log("more/slambot-24JUL14_14m.clf.gz", "RPLIDAR A1"),
-    "slambot-1AUG14_30m": Log("more/slambot-1AUG14_30m.clf.gz", "RPLIDAR A1"),
-    "tb4-mac2": Log("more/tb4-mac2.clf.gz", "RPLIDAR A1"),
-    "neato-ks-avoid": Log("more/neato-ks-avoid.clf.gz", "Neato LDS"),
-    "neato-zn-square": Log("more/neato-zn-square.clf.gz", "Neato LDS"),
-    "neato-olin18-avoid": Log("more/neato-olin18-avoid.clf.gz", "Neato LDS"),
+    "intel": Log("intel/intel.clf.gz", SICK),
+    "aces": Log("aces/aces.clf.gz", SICK),
+    "exp1": Log("urg04lx/exp1.dat.gz", URG),
+    "exp2": Log("urg04lx/exp2.dat.gz", URG),
+    "test_lab": Log("urg04lx/test_lab.clf.gz", URG),
+    "freiburg-101": Log("keyscans/freiburg-101.clf.gz", SICK),
+    "fhw": Log("keyscans/fhw.clf.gz", SICK),
+    "wean2": Log("more/wean2.clf.gz", SICK),
+    "wean4": Log("more/wean4.clf.gz", SICK),
+    "dp-loop5": Log("more/dp-loop5.clf.gz", SICK),
+    "slambot-24JUL14_14m": Log("more/slambot-24JUL14_14m.clf.gz", RPLIDAR),
+    "slambot-1AUG14_30m": Log("more/slambot-1AUG14_30m.clf.gz", RPLIDAR),
+    "tb4-mac2": Log("more/tb4-mac2.clf.gz", RPLIDAR),
+    "neato-ks-avoid": Log("more/neato-ks-avoid.clf.gz", NEATO),
+    "neato-zn-square": Log("more/neato-zn-square.clf.gz", NEATO),
+    "neato-olin18-avoid": Log("more/neato-olin18-avoid.clf.gz", NEATO),
     "yd-38": Log("more/yd-38.clf.gz", "YDLIDAR X4"),
-    "ccny": Log("handheld/ccny.clf.gz", "URG-04LX", wheels=False),
+    "ccny": Log("handheld/ccny.clf.gz", URG, wheels=False),
     "utm": Log("utm30lx/scans.npz", "UTM-30LX", wheels=False),
-    "funrobo-urg": Log("more/funrobo-urg.clf.gz", "URG-04LX", wheels=False),
-    "leg-stat": Log("more/leg-stat.clf.gz", "URG-04LX", wheels=False),
-    "windsor-a": Log("more/windsor-a.clf.gz", "RPLIDAR", wheels=False),
+    "funrobo-urg": Log("more/funrobo-urg.clf.gz", URG, wheels=False),
+    "leg-stat": Log("more/leg-stat.clf.gz", URG, wheels=False),
+    "windsor-a": Log("more/windsor-a.clf.gz", RPLIDAR, wheels=False),
 }
 
 
 def folder() -> Path:
-    """The folder of real logs.
-
-    Raises:
-        Skipped: there is none.
-    """
+    """The folder of real logs; raises Skipped where there is none."""
     named = os.environ.get(VARIABLE)
     if not named or not Path(named).is_dir():
         raise Skipped(f"{VARIABLE} must name the folder of real logs (see docs/data.md)")
     return Path(named)
 
 
-def present(wheels_only: bool = False) -> list[str]:
+def present(of: tuple[str, ...] = tuple(LOGS)) -> list[str]:
     """The names of those logs that are there; raises Skipped where none is."""
-    root = folder()
-    names = [name for name, log in LOGS.items() if (root / log.source).is_file() and (log.wheels or not wheels_only)]
+    names = [name for name in of if (folder() / LOGS[name].source).is_file()]
     if not names:
-        raise Skipped(f"{root} holds none of the logs of docs/data.md")
+        raise Skipped(f"{folder()} holds none of {', '.join(of)}")
     return names
 
 
@@ -102,7 +91,7 @@ def clf(name: str) -> Path:
     return made
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(eq=False)
 class Drive:
     """A log as arrays.
 
@@ -121,7 +110,7 @@ class Drive:
     index: Array
     begun: int = 0
 
-    @property
+    @cached_property
     def none(self) -> float:
         """Range that stands for no return, m."""
         return float(self.ranges.max()) if self.setup[0] == "FLASER" else 0.0
@@ -129,16 +118,14 @@ class Drive:
     @property
     def returned(self) -> Array:
         """(n, beams) true where a beam has a return."""
-        largest = float(self.setup[5]) if self.setup[0] == "ROBOTLASER1" else float(self.ranges.max())
+        largest = self.none or float(self.setup[5])
         return np.asarray((self.ranges > 0.0) & (self.ranges < UNRETURNED * largest))
 
-    @property
+    @cached_property
     def bearings(self) -> Array:
         """(beams,) bearings as seen from the lidar, rad."""
-        count = self.ranges.shape[1]
-        if self.setup[0] == "ROBOTLASER1":
-            return float(self.setup[2]) + float(self.setup[4]) * np.arange(count)
-        return np.radians(-90.0 + (180.0 if count == 180 else 180.0 * count / (count - 1.0)) / count * np.arange(count))
+        start, step = (-0.5 * np.pi, np.pi / 180.0) if self.none else (float(self.setup[2]), float(self.setup[4]))
+        return np.asarray(start + step * np.arange(self.ranges.shape[1]))
 
     @property
     def way(self) -> Array:
@@ -150,17 +137,16 @@ class Drive:
         for name in ("stamps", "ranges", "laser", "robot", "index"):
             setattr(self, name, getattr(self, name)[which])
 
-    def ride(self, steps: Array) -> None:
-        """Let odometry measure other steps (n - 1, 3) between the scans, each in the frame of the one before."""
-        mount = se2.between(self.robot[0], self.laser[0])
-        pose = self.robot[0]
-        for k, step in enumerate(steps):
-            pose = se2.compose(pose, step)
-            self.robot[k + 1], self.laser[k + 1] = pose, se2.compose(pose, mount)
-
     def steps(self) -> Array:
-        """(n - 1, 3) steps of odometry between the scans."""
+        """(n - 1, 3) steps of odometry between the scans, each in the frame of the scan before."""
         return np.array([se2.between(a, b) for a, b in zip(self.robot[:-1], self.robot[1:], strict=True)])
+
+    def ride(self, steps: Array, since: int = 0) -> None:
+        """Let odometry measure these steps (k, 3) from a scan on."""
+        mount = se2.between(self.robot[0], self.laser[0])
+        for k, step in enumerate(steps, since):
+            self.robot[k + 1] = se2.compose(self.robot[k], step)
+        self.laser[since:] = [se2.compose(pose, mount) for pose in self.robot[since:]]
 
     def write(self, path: Path) -> Path:
         """As a CARMEN log."""
@@ -178,23 +164,14 @@ def read(path: Path) -> Drive:
     """A CARMEN log as arrays; scans with another number of beams than most are left out."""
     with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
         lines = [(line, line.split()) for line in file]
-    other = [line for line, words in lines if words and words[0] not in LASER_LINES]
-    scans = [words for _, words in lines if words and words[0] in LASER_LINES]
+    scans = [words for _, words in lines if words and words[0] in ("FLASER", "ROBOTLASER1")]
+    other = [line for line, words in lines if words and words[0] not in ("FLASER", "ROBOTLASER1")]
     at = 2 if scans[0][0] == "FLASER" else 9
-    usual = Counter(int(words[at - 1]) for words in scans).most_common(1)[0][0]
-    stamps, ranges, poses = [], [], []
-    for words in scans:
-        if int(words[at - 1]) != usual:
-            continue
-        after = at + usual + (0 if at == 2 else 1 + int(words[at + usual]))
-        stamps.append(float(words[-3]))
-        ranges.append(np.array(words[at : at + usual], float))
-        poses.append(np.array(words[after : after + 6], float))
-    pose = np.array(poses)
-    whole = np.nan_to_num(np.array(ranges), nan=0.0, posinf=0.0)
-    return Drive(scans[0][:at], other, np.array(stamps), whole, pose[:, :3], pose[:, 3:], np.arange(len(stamps)))
-
-
-def wrapped(angle: Array) -> Array:
-    """Angles within -pi to pi, rad."""
-    return np.asarray((angle + math.pi) % math.tau - math.pi)
+    usual = Counter(words[at - 1] for words in scans).most_common(1)[0][0]
+    scans = [words for words in scans if words[at - 1] == usual]
+    end = at + int(usual)
+    poses = [end + (0 if at == 2 else 1 + int(words[end])) for words in scans]
+    ranges = np.nan_to_num(np.array([words[at:end] for words in scans], float), nan=0.0, posinf=0.0)
+    pose = np.array([words[k : k + 6] for k, words in zip(poses, scans, strict=True)], float)
+    stamps = np.array([words[-3] for words in scans], float)
+    return Drive(scans[0][:at], other, stamps, ranges, pose[:, :3], pose[:, 3:], np.arange(len(scans)))

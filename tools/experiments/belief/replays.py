@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from daemon.config.schema import Config
-from daemon.health.assessment import Vitals, assess
+from daemon.health.assessment import WINDOW_S, Vitals, assess
 from daemon.maps.map_server import OCCUPIED
 from daemon.replay.recorded_inputs import NOTHING_GIVEN, config_for
 from daemon.replay.runner import Rerun
@@ -27,19 +27,16 @@ from daemon.snapshot import GUESSED, State
 from estimator import SlowError
 from hal.errors import HalError
 from tools.experiments.belief import logs
-from tools.experiments.belief.spoil import KINDS, rng_of
+from tools.experiments.belief.spoil import spoil
 from tools.experiments.support.report import Work, code
 from tools.sim.building.world import Array
 
-MADE_BY: Final = ("logs", "spoil", "replays", "lies")
 SOURCES: Final = (
     *("estimator/**/*.py", "hal/**/*.py", "daemon/**/*.py", "tools/sim/**/*.py", "tools/experiments/integrity/*.py"),
-    *(f"tools/experiments/belief/{name}.py" for name in MADE_BY),
+    *(f"tools/experiments/belief/{name}.py" for name in ("logs", "spoil", "replays", "lies")),
 )
 START_S: Final = 5.0
-"""Time from the start from which no pose may be a guess."""
-WINDOW_S: Final = 10.0
-"""Faults that are rates are judged over this time, as in the daemon."""
+"""What is published later than this after the start counts."""
 
 
 def kept() -> Path:
@@ -49,7 +46,7 @@ def kept() -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A log, how it is spoiled, and by which chance."""
+    """A log, how it is spoiled, and the seed of the chance in it."""
 
     log: str
     kind: str = "clean"
@@ -61,12 +58,12 @@ class Watcher:
     """Samples the faults of a cycle once a second, as the heartbeat does.
 
     Attributes:
-        faults: seconds at which each fault was present, by its number.
-        mount: (t, yaw of the mount less the configured one in rad, its sigma, 1 if it is reported).
+        faults: times at which each fault was present, by its number.
+        mount: (t, estimated yaw of the mount less the configured one, rad).
     """
 
     faults: dict[int, list[float]] = field(default_factory=lambda: defaultdict(list))
-    mount: list[tuple[float, float, float, float]] = field(default_factory=list)
+    mount: list[tuple[float, float]] = field(default_factory=list)
     _past: deque[Vitals] = field(default_factory=deque)
 
     def look(self, cycle: Cycle, t: float) -> None:
@@ -79,8 +76,7 @@ class Watcher:
         for fault in assess(now, self._past[0] if self._past else now):
             self.faults[int(fault)].append(t)
         if now.slow is not None:
-            at = SlowError.MOUNT_YAW
-            self.mount.append((t, now.slow.value[at], now.slow.sigma[at], float(now.slow.mount)))
+            self.mount.append((t, now.slow.value[SlowError.MOUNT_YAW]))
         self._past.append(now)
 
 
@@ -91,119 +87,95 @@ class Replayed:
     Attributes:
         refused: why the log was refused; empty: it was not.
         rows: (n, 8) one row a scan: its number in the log, t in s, x, y, yaw, state, bounds in m and rad (inf: none).
-        faults, mount: see :class:`Watcher`, by the same time.
-        begun: time from which it was spoiled. speed: log seconds per processor second.
-        final: (n, 4) stamps and poses as finally optimised; of a clean run. cells: (k, 2) occupied cells of its map.
+        watcher: faults, by the same time. begun: time from which it was spoiled. speed: log over processor seconds.
+        final: (n, 4) stamps and poses as finally optimised. cells: (k, 2) occupied cells of the map of a clean run.
     """
 
     refused: str = ""
     rows: Array = field(default_factory=lambda: np.zeros((0, 8)))
-    faults: dict[int, list[float]] = field(default_factory=dict)
-    mount: list[tuple[float, float, float, float]] = field(default_factory=list)
+    watcher: Watcher = field(default_factory=Watcher)
     begun: float = 0.0
     speed: float = math.nan
-    final: Array | None = None
-    cells: Array | None = None
+    final: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    cells: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def late(self) -> Array:
         """(n,) published states from :data:`START_S` on."""
-        return self.rows[self.rows[:, 1] > self.rows[:1, 1].sum() + START_S, 5]
+        return np.asarray(self.rows[self.rows[:, 1] > self.rows[:1, 1].sum() + START_S, 5])
 
     def guesses(self) -> int:
-        """Scans whose pose is a guess, from :data:`START_S` on."""
-        return int(np.isin(self.late, [float(state) for state in GUESSED]).sum())
+        """Scans from then on whose pose is a guess."""
+        return int(np.isin(self.late, GUESSED).sum())
 
     def tracking(self) -> float:
-        """Share of the scans with state TRACKING, from :data:`START_S` on."""
-        return float((self.late == State.TRACKING).mean()) if len(self.late) else 0.0
+        """Share (%) of the scans from then on with state TRACKING."""
+        return 100.0 * float((self.late == State.TRACKING).mean()) if len(self.late) else math.nan
 
     def off(self, clean: Replayed) -> Array:
-        """(n, 2) distance in m and rad from the clean run's pose of the same scan; NaN where one has none."""
-        there = dict(zip(clean.rows[:, 0].tolist(), clean.rows[:, 2:5], strict=True))
-        nothing = np.full(3, np.nan)
-        other = np.array([there.get(number, nothing) for number in self.rows[:, 0].tolist()]).reshape(-1, 3)
-        away = np.hypot(*(self.rows[:, 2:4] - other[:, :2]).T)
-        return np.column_stack([away, np.abs(logs.wrapped(self.rows[:, 4] - other[:, 2]))])
+        """(n, 2) distance in m and rad from the clean run's pose of the same scan; infinite where one has none."""
+        there = np.full((int(max(self.rows[:, 0].max(), clean.rows[:, 0].max())) + 1, 3), np.nan)
+        there[clean.rows[:, 0].astype(int)] = clean.rows[:, 2:5]
+        e = self.rows[:, 2:5] - there[self.rows[:, 0].astype(int)]
+        away = np.column_stack([np.hypot(e[:, 0], e[:, 1]), np.abs((e[:, 2] + np.pi) % (2.0 * np.pi) - np.pi)])
+        return np.nan_to_num(away, nan=np.inf)
 
-    def end(self, clean: Replayed) -> float:
-        """Distance of the last pose from the clean run's, m; infinite without one."""
-        if not len(self.rows):
-            return math.inf
-        last = self.off(clean)[-1, 0]
-        return float(last) if math.isfinite(last) else math.inf
-
-    def named(self, faults: Iterable[int], since: float) -> float:
-        """When one of these faults was present first, from an instant on; infinite: never."""
-        return min((t for fault in faults for t in self.faults.get(int(fault), []) if t >= since), default=math.inf)
-
-
-def log_of(task: Task, folder: Path) -> tuple[Path, logs.Drive | None]:
-    """The log of a task as a file; with its arrays where it is spoiled."""
-    path = logs.clf(task.log)
-    if task.kind == "clean":
-        return path, None
-    drive = logs.read(path)
-    KINDS[task.kind](drive, rng_of(task.log, task.kind, task.seed))
-    return drive.write(folder / "spoiled.clf"), drive
+    def named(self, faults: Iterable[int]) -> float:
+        """When one of these faults was present first since it was spoiled; infinite: never."""
+        times = (t for fault in faults for t in self.watcher.faults.get(int(fault), []) if t >= self.begun)
+        return min(times, default=math.inf)
 
 
 def replayed(task: Task) -> Replayed:
-    """Replay one."""
+    """Replay one, as a stranger's: without any configuration."""
     logging.disable(logging.CRITICAL)  # what spoiled drives have to say
+    path = logs.clf(task.log)
     with tempfile.TemporaryDirectory() as folder:
-        path, drive = log_of(task, Path(folder))
-        return followed(path, drive, with_map=task.kind == "clean" and logs.LOGS[task.log].urg)
+        if task.kind == "clean":
+            return followed(path, with_map=logs.LOGS[task.log].lidar == logs.URG)
+        drive = spoil(logs.read(path), task.log, task.kind, task.seed)
+        found = followed(drive.write(Path(folder) / "spoiled.clf"))
+    if len(found.rows):
+        found.begun = float(
+            found.rows[min(int(np.searchsorted(found.rows[:, 0], drive.begun)), len(found.rows) - 1), 1]
+        )
+        found.rows[:, 0] = drive.index[found.rows[:, 0].astype(int)]
+    return found
 
 
-def followed(path: Path, drive: logs.Drive | None, with_map: bool = False) -> Replayed:
-    """A CARMEN log through the daemon's cycle, without any configuration; ``drive``: its arrays, where spoiled."""
-    try:
-        source = open_log(path)
-        rerun = Rerun(source, config_for(source, Config(), NOTHING_GIVEN))
-    except HalError as error:
-        return Replayed(refused=str(error))
+def followed(path: Path, with_map: bool = False) -> Replayed:
+    """A CARMEN log through the daemon's cycle."""
     rows: list[tuple[float, ...]] = []
     watcher = Watcher()
 
     def watch(record: CycleRecord) -> None:
-        snapshot = record.snapshot
         watcher.look(rerun.cycle, record.t_mono)
         if record.scan is not None:
-            pose, trust = snapshot.pose or (math.nan,) * 3, snapshot.trust
+            pose, trust = record.snapshot.pose or (math.nan,) * 3, record.snapshot.trust
             bounds = (math.inf if bound is None else bound for bound in (trust.horizontal_m, trust.yaw_rad))
-            rows.append((float(record.scan), record.t_mono, *pose, float(snapshot.state), *bounds))
+            rows.append((float(record.scan), record.t_mono, *pose, float(record.snapshot.state), *bounds))
 
-    rerun.watch = watch
-    begun = time.process_time()
     try:
+        source = open_log(path)
+        rerun = Rerun(source, config_for(source, Config(), NOTHING_GIVEN))
+        rerun.watch = watch
+        begun = time.process_time()
         for event in source.events():
             rerun.feed(event)
     except HalError as error:
         return Replayed(refused=str(error))
     rerun.finish()
-    spent = time.process_time() - begun
-    table = np.array(rows).reshape(-1, 8)
-    found = Replayed(rows=table, faults=dict(watcher.faults), mount=watcher.mount)
-    found.speed = float(np.ptp(table[:, 1])) / spent if len(table) else math.nan
-    if drive is not None:
-        found.begun = (
-            float(table[np.searchsorted(table[:, 0], min(drive.begun, len(table) - 1)), 1]) if len(table) else 0.0
-        )
-        table[:, 0] = drive.index[table[:, 0].astype(int)]
-    else:
-        final = rerun.ledger.final()
-        found.final = np.column_stack([final.stamps, final.poses])
+    spent, final = time.process_time() - begun, rerun.ledger.final()
+    found = Replayed(rows=np.array(rows).reshape(-1, 8), watcher=watcher)
+    found.speed, found.final = float(np.ptp(found.rows[:, 1])) / spent, np.column_stack([final.stamps, final.poses])
     if with_map:
         grid = rerun.render()
-        at = np.argwhere(grid.probability > OCCUPIED)[:, ::-1]
-        found.cells = grid.origin + grid.resolution * (at + 0.5)
+        found.cells = grid.origin + grid.resolution * (np.argwhere(grid.probability > OCCUPIED)[:, ::-1] + 0.5)
     return found
 
 
-def replay(work: Work, tasks: Iterable[Task], label: str = "replays") -> dict[Task, Replayed]:
+def replay(work: Work, tasks: Iterable[Task]) -> dict[Task, Replayed]:
     """Replay them all, with the clean runs of their logs; what was made already is taken from the disk."""
-    wanted = dict.fromkeys(tasks)
-    whole = [*dict.fromkeys(Task(task.log) for task in wanted), *wanted]
-    order = list(dict.fromkeys(whole))
-    return dict(zip(order, work.map(replayed, order, label, kept()), strict=True))
+    wanted = list(tasks)
+    order = list(dict.fromkeys([*(Task(task.log) for task in wanted), *wanted]))
+    return dict(zip(order, work.map(replayed, order, "replays", kept()), strict=True))

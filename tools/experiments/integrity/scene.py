@@ -50,7 +50,7 @@ class Scenario:
         ceilings: (from when, lamps that shine from then on). told: what the robot knows of them.
         blind, dark: (from, to) when the lidar, the photodiode is covered.
         recoverable: (from, to) when the right place could be known. clean: nothing goes wrong at all.
-        mount: from when to when the lidar's mount is turned: by an angle (rad) at once, and on by a rate (rad/s).
+        mount: from when the lidar's mount is turned: by an angle (rad) at once, and on by a rate (rad/s).
         restarts: when the daemon is switched off and on again with the map that it has made.
     """
 
@@ -68,7 +68,7 @@ class Scenario:
     dark: tuple[tuple[float, float], ...] = ()
     recoverable: tuple[tuple[float, float], ...] = ()
     clean: bool = False
-    mount: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    mount: tuple[float, float, float] = (np.inf, 0.0, 0.0)
     restarts: tuple[float, ...] = ()
     seconds: float = SECONDS
     notes: dict[str, object] = field(default_factory=dict)
@@ -91,8 +91,8 @@ class Scenario:
 
     def turned(self, t: Array) -> Array:
         """(n,) yaw of the lidar less that of its configured mount, rad."""
-        since, until, angle, rate = self.mount
-        return np.where((t >= since) & (t < until), angle + rate * (t - since), 0.0)
+        since, angle, rate = self.mount
+        return np.where(t >= since, angle + rate * np.maximum(t - since, 0.0), 0.0)
 
     def tilt(self, t: float) -> tuple[float, float]:
         """Pitch and roll of the scan plane."""
