@@ -6,7 +6,6 @@ lies; a survey is wrong from the start, and a mount that was turned stays so.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from estimator.numerics import se2
 from hal.imu import RawImu
 from hal.lidar import RawScan
 from hal.odometry import RawOdometry
-from tools.experiments.belief.replays import Watcher
+from tools.experiments.belief.replays import Watcher, quiet
 from tools.experiments.integrity.report import Found, judged
 from tools.experiments.integrity.run import arrivals, robot_of, row
 from tools.experiments.integrity.scene import Scenario, draw
@@ -212,9 +211,9 @@ class Told:
     other: int
 
 
+@quiet()
 def told(case: Case) -> Told | None:
     """Run one case; None where nothing can drive in the room that was drawn."""
-    logging.disable(logging.CRITICAL)
     lie = LIES.get(case.lie, Lie(()))
     try:
         scene = draw(case.kind, case.seed)

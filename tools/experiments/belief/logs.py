@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from daemon.replay.convert import convert
 from estimator.numerics import se2
 from tools.experiments.support.report import Skipped
 from tools.sim.building.world import Array
+
+Index = npt.NDArray[np.int_]
 
 VARIABLE: Final = "LUMILOOP_DATA"
 UNRETURNED: Final = 0.98
@@ -67,11 +70,11 @@ def folder() -> Path:
     return Path(named)
 
 
-def present(of: tuple[str, ...] = tuple(LOGS)) -> list[str]:
-    """The names of those logs that are there; raises Skipped where none is."""
-    names = [name for name in of if (folder() / LOGS[name].source).is_file()]
+def present(of: tuple[str, ...] = ()) -> list[str]:
+    """The names of those logs that are there, of all or of some; raises Skipped where none is."""
+    names = [name for name in of or LOGS if (folder() / LOGS[name].source).is_file()]
     if not names:
-        raise Skipped(f"{folder()} holds none of {', '.join(of)}")
+        raise Skipped(f"{folder()} holds none of {', '.join(of or LOGS)}")
     return names
 
 
@@ -107,7 +110,7 @@ class Drive:
     ranges: Array
     laser: Array
     robot: Array
-    index: Array
+    index: Index
     begun: int = 0
 
     @cached_property
@@ -132,7 +135,7 @@ class Drive:
         """(n,) path length by odometry up to each scan, m."""
         return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.robot[:, :2], axis=0).T))])
 
-    def keep(self, which: Array) -> None:
+    def keep(self, which: Index) -> None:
         """Leave some of the scans, in the given order."""
         for name in ("stamps", "ranges", "laser", "robot", "index"):
             setattr(self, name, getattr(self, name)[which])

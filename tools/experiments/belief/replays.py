@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import tempfile
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -42,6 +43,17 @@ START_S: Final = 5.0
 def kept() -> Path:
     """Folder of what this code has made."""
     return Path("out/belief") / code(*SOURCES)
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Nothing is logged: spoiled drives and lying sensors have much to say."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +130,7 @@ class Replayed:
         there[clean.rows[:, 0].astype(int)] = clean.rows[:, 2:5]
         e = self.rows[:, 2:5] - there[self.rows[:, 0].astype(int)]
         away = np.column_stack([np.hypot(e[:, 0], e[:, 1]), np.abs((e[:, 2] + np.pi) % (2.0 * np.pi) - np.pi)])
-        return np.nan_to_num(away, nan=np.inf)
+        return np.asarray(np.where(np.isnan(away), np.inf, away))
 
     def named(self, faults: Iterable[int]) -> float:
         """When one of these faults was present first since it was spoiled; infinite: never."""
@@ -126,9 +138,9 @@ class Replayed:
         return min(times, default=math.inf)
 
 
+@quiet()
 def replayed(task: Task) -> Replayed:
     """Replay one, as a stranger's: without any configuration."""
-    logging.disable(logging.CRITICAL)  # what spoiled drives have to say
     path = logs.clf(task.log)
     with tempfile.TemporaryDirectory() as folder:
         if task.kind == "clean":

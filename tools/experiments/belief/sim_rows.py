@@ -45,7 +45,7 @@ def lies(work: Work) -> Report:
     every = _told(work, [case for cases in groups.values() for case in cases])
     table = [(name, *_summed(some)) for name, of in groups.items() if (some := [every[c] for c in of if c in every])]
     third = [one for one in every.values() if one.case.lit or LIES[one.case.lie].culprits == GYRO]
-    beyond, cycles = (sum(row[k] for row in table) for k in (8, 9))
+    beyond, cycles = (sum(getattr(one.found, name) for one in every.values()) for name in ("beyond_bound", "bounded"))
     head = ("lie", "drives", "TRACKING and wrong, longest, s", "drives in which too long", "worst, m", "worst, deg",
             "named after, worst, s", "named instead", "cycles beyond the bound", "of cycles")  # fmt: skip
     figures = (

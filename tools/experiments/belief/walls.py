@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from tools.experiments.belief.logs import Drive, wrapped
+from tools.experiments.belief.logs import Drive
 from tools.sim.building.world import Array
 
 NEAR_M, GAP_M = 0.06, 0.5
@@ -21,7 +21,7 @@ STEADY: Final = 0.3
 
 def of_scans(drive: Drive) -> tuple[float, int]:
     """Median angle (deg) over the scans that show two walls, and how many do."""
-    rate = np.abs(wrapped(np.gradient(np.unwrap(drive.robot[:, 2])))) / np.gradient(drive.stamps)
+    rate = np.abs(np.gradient(np.unwrap(drive.robot[:, 2]))) / np.gradient(drive.stamps)
     found = []
     for k in np.flatnonzero(rate < STEADY).tolist():
         seen = drive.returned[k]
