@@ -1,7 +1,5 @@
 """The rows of belief: all are there, and the smallest of each sort runs on what tests can make by themselves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@
 LUMILOOP_DATA. What has been made is kept in ``out/belief/<code>`` and not made again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 

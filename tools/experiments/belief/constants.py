@@ -4,8 +4,6 @@ Read from the sources: numbers that a module, or a class of settings, binds to a
 counts as many as it has names. Layouts of arrays, optics of a lamp and the reading of surveys are left out.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator
@@ -20,7 +18,7 @@ LEFT_OUT: Final = frozenset({"state_vector", "lambertian", "survey", "residual_m
 """Modules whose numbers describe data."""
 MOST: Final = 60
 Row = tuple[str, str, str, str]
-"""Name, value as written, meaning, file and line."""
+"""Name, value as written, meaning, file."""
 
 
 def constants(part: str, root: Path = ROOT) -> list[Row]:
@@ -34,8 +32,7 @@ def constants(part: str, root: Path = ROOT) -> list[Row]:
         for owner, nodes in (("", body), *((f"{node.name}.", node.body) for node in classes)):
             for at, name, value in bound(nodes):
                 if owner or name.isupper():
-                    where = f"{path.name}:{nodes[at].lineno}"
-                    found.append((owner + name, ast.unparse(value), meaning(nodes, at, name), where))
+                    found.append((owner + name, ast.unparse(value), meaning(nodes, at, name), path.name))
     return found
 
 
@@ -44,9 +41,10 @@ def bound(body: list[ast.stmt]) -> Iterator[tuple[int, str, ast.expr]]:
     for at, node in enumerate(body):
         if isinstance(node, ast.AnnAssign | ast.Assign) and node.value is not None:
             target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
-            both = (target, node.value)
-            group = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
-            for each, value in zip(*(one.elts for one in both), strict=True) if group else [both]:
+            pairs = [(target, node.value)]
+            if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                pairs = list(zip(target.elts, node.value.elts, strict=True))
+            for each, value in pairs:
                 if isinstance(each, ast.Name) and number(value):
                     yield at, each.id, value
 
@@ -94,5 +92,5 @@ def run(quick: bool, work: Work) -> Report:
         bounded("constants that decide belief", len(every), "", f"<= {MOST}", command),
         bounded("constants without a meaning beside them", sum(not row[2] for row in every), "", "<= 0", command),
     )
-    head = ("constant", "value", "meaning, unit, source", "where")
+    head = ("constant", "value", "meaning, unit, source", "file")
     return Report(figures, tuple(Table(f"{part}: {len(rows)}", head, tuple(rows)) for part, rows in found.items()))

@@ -4,8 +4,6 @@ A robot drives through a room for a minute, under lamps or by laser and wheels a
 lies; a survey is wrong from the start, and a mount that was turned stays so.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The open real logs, and one of them as arrays that can be spoiled and written again as a CARMEN log."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import tempfile

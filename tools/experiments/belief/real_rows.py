@@ -1,7 +1,5 @@
 """Rows on open real logs: clean, perturbed and spoiled drives, wrong wheels, turned mounts, references and speed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -133,7 +131,7 @@ def perturbed(work: Work) -> Report:
     for name in names:
         runs = [found[Task(name, "perturbed", seed)] for seed in seeds]
         guesses = [run.guesses() for run in runs]
-        ends = np.array([run.rows[-1, 2:4] for run in runs])
+        ends = np.array([run.rows[-1, 2:4] for run in (*runs, found[Task(name)])])
         spread = 100.0 * float(np.hypot(*(ends - np.median(ends, axis=0)).T).max())
         table.append((name, logs.LOGS[name].lidar, sum(map(bool, guesses)), max(guesses), spread))
     figures = [
@@ -147,7 +145,7 @@ def perturbed(work: Work) -> Report:
         worst = max((row[4] for row in some), default=0.0)
         figures.append(figure("perturbed", f"spread of the end pose, worst log, {lidar}", worst, "cm", limit))
     head = ("log", "lidar", "replays with guesses", "guesses, most", "spread of the end, cm")
-    note = "spread: largest distance of an end from the median end of the replays of one log"
+    note = "spread: largest distance of an end from the median end of the replays of one log, the clean one among them"
     return Report(tuple(figures), (Table("Perturbed replays", head, tuple(table)),), seeds=tuple(seeds), notes=(note,))
 
 

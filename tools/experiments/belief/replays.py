@@ -1,7 +1,5 @@
 """One real log, as it is or spoiled, through the daemon's cycle: what was published with each scan, and its faults."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math
@@ -124,7 +122,7 @@ class Replayed:
         """Share (%) of the scans from then on with state TRACKING."""
         return 100.0 * float((self.late == State.TRACKING).mean()) if len(self.late) else math.nan
 
-    def off(self, clean: Replayed) -> Array:
+    def off(self, clean: "Replayed") -> Array:
         """(n, 2) distance in m and rad from the clean run's pose of the same scan; infinite where one has none."""
         there = np.full((int(max(self.rows[:, 0].max(), clean.rows[:, 0].max())) + 1, 3), np.nan)
         there[clean.rows[:, 0].astype(int)] = clean.rows[:, 2:5]

@@ -1,7 +1,5 @@
 """Rows in the simulator: sensors that lie, the full solution against its subsets, and honest covariances."""
 
-from __future__ import annotations
-
 import importlib
 import math
 from collections.abc import Sequence

@@ -1,10 +1,9 @@
 """Real drives spoiled as robots in the field spoil theirs: each kind by itself, at random from a seed."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -42,26 +41,18 @@ def _perturbed(drive: Drive, rng: Rng) -> None:
     drive.ranges = np.where(rng.random(moved.shape) < DROPPED, drive.none, moved)
 
 
-def _rate(hertz: float) -> Spoil:
+def _rate(drive: Drive, rng: Rng, hertz: float) -> None:
     """A lidar that turns more slowly."""
-
-    def spoiled(drive: Drive, rng: Rng) -> None:
-        every = max(1, round(1.0 / (hertz * float(np.median(np.diff(drive.stamps))))))
-        drive.keep(np.arange(int(rng.integers(every)), len(drive.stamps), every))
-
-    return spoiled
+    every = max(1, round(1.0 / (hertz * float(np.median(np.diff(drive.stamps))))))
+    drive.keep(np.arange(int(rng.integers(every)), len(drive.stamps), every))
 
 
-def _reading(x_m: float, yaw: float, count: int = 1) -> Spoil:
+def _reading(drive: Drive, rng: Rng, x_m: float, yaw: float, count: int = 1) -> None:
     """The odometry pose is wrong in a few readings, and right again in the next."""
-
-    def spoiled(drive: Drive, rng: Rng) -> None:
-        at = _somewhere(drive, rng)
-        off = rng.choice([-1.0, 1.0], 3) * (x_m, 0.0, yaw)
-        drive.robot[at : at + count] += off
-        drive.laser[at : at + count] += off
-
-    return spoiled
+    at = _somewhere(drive, rng)
+    off = rng.choice([-1.0, 1.0], 3) * (x_m, 0.0, yaw)
+    drive.robot[at : at + count] += off
+    drive.laser[at : at + count] += off
 
 
 def _poor_second(drive: Drive, rng: Rng) -> None:
@@ -72,32 +63,24 @@ def _poor_second(drive: Drive, rng: Rng) -> None:
         drive.ranges[k, seen[np.argsort(drive.ranges[k, seen])[drive.ranges.shape[1] // 8 :]]] = drive.none
 
 
-def _gap(seconds: float) -> Spoil:
+def _gap(drive: Drive, rng: Rng, seconds: float) -> None:
     """Nothing is received for a while."""
-
-    def spoiled(drive: Drive, rng: Rng) -> None:
-        since = drive.stamps - drive.stamps[_somewhere(drive, rng)]
-        drive.keep(np.flatnonzero((since < 0.0) | (since >= seconds)))
-
-    return spoiled
+    since = drive.stamps - drive.stamps[_somewhere(drive, rng)]
+    drive.keep(np.flatnonzero((since < 0.0) | (since >= seconds)))
 
 
-def _visitors(count: int) -> Spoil:
+def _visitors(drive: Drive, rng: Rng, count: int) -> None:
     """People who walk along with the robot, some metres in front of it."""
-
-    def spoiled(drive: Drive, rng: Rng) -> None:
-        at, speed = rng.uniform(NEAR, FAR, (count, 2)), rng.uniform((-0.3, -0.8), (0.3, 0.8), (count, 2))
-        seen = np.where(drive.returned, drive.ranges, np.inf)
-        for k, dt in enumerate(np.clip(np.diff(drive.stamps, prepend=drive.stamps[0]), 0.0, 1.0).tolist()):
-            at = at + dt * speed
-            speed = np.where((at < NEAR) & (speed < 0.0) | (at > FAR) & (speed > 0.0), -speed, speed)
-            ahead = np.exp(-1j * drive.bearings)[None, :] * (at[:, :1] + 1j * at[:, 1:])
-            half = np.sqrt(np.maximum(LEG_M**2 - ahead.imag**2, 0.0))
-            leg = np.where((half > 0.0) & (ahead.real > 0.0), ahead.real - half, np.inf).min(axis=0)
-            hit = leg < seen[k]
-            drive.ranges[k, hit] = leg[hit] + rng.normal(0.0, 0.01, int(hit.sum()))
-
-    return spoiled
+    at, speed = rng.uniform(NEAR, FAR, (count, 2)), rng.uniform((-0.3, -0.8), (0.3, 0.8), (count, 2))
+    seen = np.where(drive.returned, drive.ranges, np.inf)
+    for k, dt in enumerate(np.clip(np.diff(drive.stamps, prepend=drive.stamps[0]), 0.0, 1.0).tolist()):
+        at = at + dt * speed
+        speed = np.where((at < NEAR) & (speed < 0.0) | (at > FAR) & (speed > 0.0), -speed, speed)
+        ahead = np.exp(-1j * drive.bearings)[None, :] * (at[:, :1] + 1j * at[:, 1:])
+        half = np.sqrt(np.maximum(LEG_M**2 - ahead.imag**2, 0.0))
+        leg = np.where((half > 0.0) & (ahead.real > 0.0), ahead.real - half, np.inf).min(axis=0)
+        hit = leg < seen[k]
+        drive.ranges[k, hit] = leg[hit] + rng.normal(0.0, 0.01, int(hit.sum()))
 
 
 def _glass(drive: Drive, rng: Rng) -> None:
@@ -114,17 +97,9 @@ def _swapped(drive: Drive, rng: Rng) -> None:
     drive.keep(order)
 
 
-def _clock(change: Callable[[Array, int], object]) -> Spoil:
+def _clock(drive: Drive, rng: Rng, change: Callable[[Array, int], object]) -> None:
     """Stamps (n,) are changed, from a scan on."""
-
-    def spoiled(drive: Drive, rng: Rng) -> None:
-        drive.stamps = np.asarray(change(drive.stamps.copy(), _somewhere(drive, rng)))
-
-    return spoiled
-
-
-def _set(seconds: float) -> Spoil:
-    return _clock(lambda t, at: np.where(np.arange(len(t)) < at, t, t + seconds))
+    drive.stamps = np.asarray(change(drive.stamps.copy(), _somewhere(drive, rng)))
 
 
 def _restarted(drive: Drive, rng: Rng) -> None:
@@ -134,32 +109,24 @@ def _restarted(drive: Drive, rng: Rng) -> None:
     drive.ride(steps[at:], at)
 
 
-def _wheels(change: Callable[[Array], Array], seconds: float = math.inf) -> Spoil:
+def _wheels(drive: Drive, rng: Rng, change: Callable[[Array], Array], seconds: float = math.inf) -> None:
     """Odometry measures other steps than the robot makes: ``change`` of the steps (k, 3) of that time, or of all."""
-
-    def spoiled(drive: Drive, rng: Rng) -> None:
-        steps, at = drive.steps(), 0
-        if math.isfinite(seconds):
-            at = _somewhere(drive, rng, np.hypot(*np.diff(drive.robot[:, :2], axis=0, append=np.nan).T) > 0.01)
-        until = max(int(np.searchsorted(drive.stamps, drive.stamps[at] + seconds)), at + 1)
-        steps[at:until] = change(steps[at:until])
-        drive.ride(steps)
-
-    return spoiled
+    steps, at = drive.steps(), 0
+    if math.isfinite(seconds):
+        at = _somewhere(drive, rng, np.hypot(*np.diff(drive.robot[:, :2], axis=0, append=np.nan).T) > 0.01)
+    until = max(int(np.searchsorted(drive.stamps, drive.stamps[at] + seconds)), at + 1)
+    steps[at:until] = change(steps[at:until])
+    drive.ride(steps)
 
 
-def _turned(degrees: float, in_drive: bool) -> Spoil:
+def _turned(drive: Drive, rng: Rng, degrees: float, in_drive: bool) -> None:
     """The lidar's mount is turned, from the start or from a third of the drive on, by whole beams."""
-
-    def spoiled(drive: Drive, rng: Rng) -> None:
-        drive.begun = len(drive.stamps) // 3 if in_drive else 0
-        count, beams = beams_of(drive, degrees), drive.ranges.shape[1]
-        drive.ranges[drive.begun :] = np.roll(drive.ranges[drive.begun :], -count, axis=1)
-        if np.ptp(drive.bearings) < math.radians(355.0):
-            outside = slice(beams - count, beams) if count > 0 else slice(0, -count)
-            drive.ranges[drive.begun :, outside] = drive.none
-
-    return spoiled
+    drive.begun = len(drive.stamps) // 3 if in_drive else 0
+    count, beams = beams_of(drive, degrees), drive.ranges.shape[1]
+    drive.ranges[drive.begun :] = np.roll(drive.ranges[drive.begun :], -count, axis=1)
+    if np.ptp(drive.bearings) < math.radians(355.0):
+        outside = slice(beams - count, beams) if count > 0 else slice(0, -count)
+        drive.ranges[drive.begun :, outside] = drive.none
 
 
 def beams_of(drive: Drive, degrees: float) -> int:
@@ -167,50 +134,50 @@ def beams_of(drive: Drive, degrees: float) -> int:
     return round(math.radians(degrees) / float(drive.bearings[1] - drive.bearings[0]))
 
 
-def _displaced(x_m: float, y_m: float) -> Spoil:
+def _displaced(drive: Drive, rng: Rng, x_m: float, y_m: float) -> None:
     """The lidar is mounted elsewhere than the log has it."""
-
-    def spoiled(drive: Drive, rng: Rng) -> None:
-        c, s = np.cos(drive.robot[:, 2]), np.sin(drive.robot[:, 2])
-        drive.laser[:, :2] += np.column_stack([c * x_m - s * y_m, s * x_m + c * y_m])
-        by = {"robot_frontlaser_offset": x_m, "robot_frontlaser_side_offset": y_m}
-        for k, words in enumerate(line.split() for line in drive.other):
-            if words[0] == "PARAM" and words[1] in by:
-                drive.other[k] = " ".join([*words[:2], f"{float(words[2]) + by[words[1]]:.6f}", *words[3:]]) + "\n"
-
-    return spoiled
+    c, s = np.cos(drive.robot[:, 2]), np.sin(drive.robot[:, 2])
+    drive.laser[:, :2] += np.column_stack([c * x_m - s * y_m, s * x_m + c * y_m])
+    by = {"robot_frontlaser_offset": x_m, "robot_frontlaser_side_offset": y_m}
+    for k, words in enumerate(line.split() for line in drive.other):
+        if words[0] == "PARAM" and words[1] in by:
+            drive.other[k] = " ".join([*words[:2], f"{float(words[2]) + by[words[1]]:.6f}", *words[3:]]) + "\n"
 
 
 SPOILED: Final[dict[str, Spoil]] = {
-    "spike": _reading(2.0, 0.0),
-    "glitch": _reading(0.0, 2.0),
-    "two glitches": _reading(0.0, 0.9, 2),
+    "spike": partial(_reading, x_m=2.0, yaw=0.0),
+    "glitch": partial(_reading, x_m=0.0, yaw=2.0),
+    "two glitches": partial(_reading, x_m=0.0, yaw=0.9, count=2),
     "poor second": _poor_second,
-    "gap of 5 s": _gap(5.0),
-    "gap of 10 s": _gap(10.0),
-    "8 visitors": _visitors(8),
-    "20 visitors": _visitors(20),
+    "gap of 5 s": partial(_gap, seconds=5.0),
+    "gap of 10 s": partial(_gap, seconds=10.0),
+    "8 visitors": partial(_visitors, count=8),
+    "20 visitors": partial(_visitors, count=20),
     "glass": _glass,
-    "5 Hz": _rate(5.0),
-    "3.3 Hz": _rate(3.3),
-    "2 Hz": _rate(2.0),
-    "1 Hz": _rate(1.0),
+    "5 Hz": partial(_rate, hertz=5.0),
+    "3.3 Hz": partial(_rate, hertz=3.3),
+    "2 Hz": partial(_rate, hertz=2.0),
+    "1 Hz": partial(_rate, hertz=1.0),
     "swapped": _swapped,
-    "clock set back": _set(-3.0),
-    "clock set on": _set(3.0),
-    "stamps repeat": _clock(lambda t, at: np.where(np.arange(len(t)) % 7 == 6, np.roll(t, 1), t)),
-    "stamps stand still": _clock(lambda t, at: np.where((np.arange(len(t)) // 12) == at // 12, t[at // 12 * 12], t)),
-    "whole seconds": _clock(lambda t, at: np.floor(t)),
-    "zero stamps": _clock(lambda t, at: 0.0 * t),
+    "clock set back": partial(_clock, change=lambda t, at: t - 3.0 * (np.arange(len(t)) >= at)),
+    "clock set on": partial(_clock, change=lambda t, at: t + 3.0 * (np.arange(len(t)) >= at)),
+    "stamps repeat": partial(_clock, change=lambda t, at: np.where(np.arange(len(t)) % 7 == 6, np.roll(t, 1), t)),
+    "stamps stand still": partial(
+        _clock, change=lambda t, at: np.where(np.arange(len(t)) // 12 == at // 12, t[at // 12 * 12], t)
+    ),
+    "whole seconds": partial(_clock, change=lambda t, at: np.floor(t)),
+    "zero stamps": partial(_clock, change=lambda t, at: 0.0 * t),
     "odometry restarts": _restarted,
 }
 """Wheels are right in all of these, but for single readings."""
 WHEELS: Final[dict[str, Spoil]] = {
-    "way +20 %": _wheels(lambda steps: steps * (1.2, 1.2, 1.0)),
-    "turn +20 %": _wheels(lambda steps: steps * (1.0, 1.0, 1.2)),
-    "dead 5 s": _wheels(lambda steps: 0.0 * steps, 5.0),
-    "spun 180 deg": _wheels(lambda steps: steps + np.array((0.0, 0.0, math.pi)) / len(steps), 2.0),
-    "slipped 3 m": _wheels(lambda steps: steps + np.array((3.0, 0.0, 0.0)) / len(steps), 3.0),
+    "way +20 %": partial(_wheels, change=lambda steps: steps * (1.2, 1.2, 1.0)),
+    "turn +20 %": partial(_wheels, change=lambda steps: steps * (1.0, 1.0, 1.2)),
+    "dead 5 s": partial(_wheels, change=lambda steps: 0.0 * steps, seconds=5.0),
+    "spun 180 deg": partial(
+        _wheels, change=lambda steps: steps + np.array((0.0, 0.0, math.pi)) / len(steps), seconds=2.0
+    ),
+    "slipped 3 m": partial(_wheels, change=lambda steps: steps + np.array((3.0, 0.0, 0.0)) / len(steps), seconds=3.0),
 }
 MOUNTS: Final = {
     f"{degrees:+d} deg {when}": (degrees, when == "in the drive")
@@ -223,6 +190,6 @@ KINDS: Final[dict[str, Spoil]] = (
     {"perturbed": _perturbed}
     | SPOILED
     | WHEELS
-    | {name: _turned(*of) for name, of in MOUNTS.items()}
-    | {name: _displaced(*of) for name, of in OFFSETS.items()}
+    | {name: partial(_turned, degrees=of[0], in_drive=of[1]) for name, of in MOUNTS.items()}
+    | {name: partial(_displaced, x_m=of[0], y_m=of[1]) for name, of in OFFSETS.items()}
 )

@@ -1,7 +1,5 @@
 """The angle between the two longest walls that are not parallel, in single scans and in a map."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
