@@ -13,7 +13,7 @@ from tools.experiments.belief.lies import GYRO, LIES, Case, Told, told
 from tools.experiments.belief.real_rows import figure
 from tools.experiments.belief.replays import kept
 from tools.experiments.integrity.run import COLUMNS
-from tools.experiments.support.report import Report, Table, Work
+from tools.experiments.support.report import Cell, Report, Table, Work
 from tools.sim.building.world import Array
 
 LIE_SEEDS, DRIVES = 3, 6
@@ -23,7 +23,7 @@ CLASSES: Final = tuple(f"{what}_{light}" for light in ("lit", "unlit") for what 
 USES: Final = ("both", "laser", "light")
 INSIDE: Final = 7.815
 """Squared Mahalanobis distance of three dimensions that 95 % are below."""
-OTHERS: Final = ("fusion", "second_world", "second-world")
+OTHERS: Final = ("fusion", "second-world")
 """Experiments whose tables belong to the row of solutions."""
 
 
@@ -81,7 +81,7 @@ def solutions(work: Work) -> Report:
 
     rms = {kind: [_rms(of(kind, use)) for use in USES] for kind in CLASSES if _lit(kind)}
     ratios = {kind: [full[k] / min(laser[k], light[k]) for k in (0, 1)] for kind, (full, laser, light) in rms.items()}
-    against = [(kind, *(v for pair in rms[kind] for v in pair), *ratios[kind]) for kind in rms]
+    against: list[tuple[Cell, ...]] = [(kind, *(v for pair in rms[kind] for v in pair), *ratios[kind]) for kind in rms]
     nees = [(kind, *honest(of(kind, "both"))) for kind in CLASSES]
     figures: list[Figure] = []
     for k, axis in enumerate(("position", "heading")):
@@ -100,7 +100,7 @@ def solutions(work: Work) -> Report:
         Table("Normalised error of the published pose", ("class", "NEES, mean", "inside 95 %, %"), tuple(nees)),
     ]
     notes = [f"a subset is a run of its own, without lamps or with the lidar covered; from {SETTLED_S:.0f} s on"]
-    for name in set(OTHERS) & set(program.EXPERIMENTS):
+    for name in (name for name in OTHERS if name in program.MODULES):
         part: Report = importlib.import_module(program.MODULES[name]).run(False, work)
         figures += part.figures
         tables += part.tables
