@@ -179,7 +179,7 @@ LIES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A lie (empty: none), the kind of scenario, its seed, and the sensors beside the wheels: laser, light or both."""
+    """A lie (empty: none), the kind of scenario, its seed, and the sensors beside the wheels: both, or light."""
 
     lie: str
     kind: str
@@ -189,7 +189,7 @@ class Case:
     @property
     def lit(self) -> bool:
         """Whether there are lamps."""
-        return not self.kind.endswith("_unlit") and self.use != "laser"
+        return not self.kind.endswith("_unlit")
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +218,7 @@ def told(case: Case) -> Told | None:
     except RuntimeError:
         return None
     scene.wheels = True
-    if case.use == "laser":
-        scene.lit, scene.ceilings, scene.told = False, (), None
-    elif case.use == "light":
+    if case.use == "light":
         scene.blind = ((0.0, scene.seconds),)
     if lie.scene is not None:
         lie.scene(scene)
