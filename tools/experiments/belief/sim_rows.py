@@ -12,7 +12,7 @@ from tools.experiments.belief.lies import GYRO, LIES, Case, Told, told
 from tools.experiments.belief.real_rows import figure
 from tools.experiments.belief.replays import kept
 from tools.experiments.integrity.run import COLUMNS
-from tools.experiments.support.report import Cell, Report, Table, Work
+from tools.experiments.support.report import Report, Table, Work
 from tools.sim.building.world import Array
 
 LIE_SEEDS, DRIVES = 3, 6
@@ -80,7 +80,7 @@ def solutions(work: Work) -> Report:
     def of(kind: str, use: str) -> list[Array]:
         return [one.rows for case, one in every.items() if (case.kind, case.use) == (kind, use) and len(one.rows)]
 
-    against: list[tuple[Cell, ...]] = []
+    against: list[tuple[str, float, float, float, float, float, float]] = []
     for kind in lit:
         full, light = _rms(of(kind, "both")), _rms(of(kind, "light"))
         against.append((kind, *full, *light, full[0] / light[0], full[1] / light[1]))
