@@ -28,7 +28,7 @@ EXPERIMENTS: Final = {
     "table1": "Table 1", "fig4": "Fig. 4", "fig5": "Fig. 5", "fig5_loops": "Fig. 5, loops closed", "fig6": "Fig. 6",
     "methods": "Sect. 5", "claim": "its claim of cost", "adaptive": "its future work", "beamquality": "Eq. 8 and 9",
     "room": "", "corridor": "", "doors": "", "islands": "", "tones": "", "static": "", "walks": "", "survey": "",
-    "relocate": "", "relocate_real": "", "integrity": "",
+    "relocate": "", "relocate_real": "", "integrity": "", "belief": "", "constants": "",
 }  # fmt: skip
 """Of what in the paper each is; nothing: ours alone."""
 MODULES: Final = {
@@ -39,6 +39,8 @@ MODULES: Final = {
 """Module of each experiment."""
 RESULTS: Final = Path("docs/results")
 QUICK: Final = Path("out/experiments/quick")
+ROWS: Final = Path("out/experiments/rows")
+"""Results of some rows of an experiment."""
 SOURCES: Final = (
     "estimator/**/*.py",
     "hal/**/*.py",
@@ -70,7 +72,7 @@ def kept(path: Path) -> dict[str, Any]:
 def run_one(name: str, options: argparse.Namespace) -> bool:
     """Run one experiment and keep what it found; returns whether it ran or had a reason not to."""
     print(f"\n== {name}", flush=True)
-    what = {"quick": options.quick, "trials": options.trials, "code": code(*SOURCES)}
+    what = {"quick": options.quick, "trials": options.trials, "rows": options.rows, "code": code(*SOURCES)}
     before = kept(options.out / f"{name}.json")
     if not options.again and before.items() >= what.items():
         print(f"made by this code already: {options.out / name}.json; --again makes it anew")
@@ -78,7 +80,8 @@ def run_one(name: str, options: argparse.Namespace) -> bool:
     begun = time.monotonic()
     try:
         module = importlib.import_module(MODULES[name])
-        report = module.run(options.quick, Work(options.jobs, sys.stderr.isatty(), options.trials))
+        work = Work(options.jobs, sys.stderr.isatty(), options.trials, tuple(filter(None, options.rows.split(","))))
+        report = module.run(options.quick, work)
     except Skipped as reason:
         print(f"skipped: {reason}")
         return True
@@ -87,7 +90,8 @@ def run_one(name: str, options: argparse.Namespace) -> bool:
         return False
     seconds = time.monotonic() - begun
     show(report)
-    words = " --quick" * options.quick + f" --trials {options.trials}" * bool(options.trials)
+    words = " --quick" * options.quick + f" --rows {options.rows}" * bool(options.rows)
+    words += f" --trials {options.trials}" * bool(options.trials)
     facts = {
         "experiment": name, "paper": EXPERIMENTS.get(name, ""), "title": (module.__doc__ or name).splitlines()[0],
         "command": f"{COMMAND} {name}{words}",
@@ -109,7 +113,10 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--again", action="store_true", help="make anew what this code has made already")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
     parser.add_argument("--trials", type=int, default=0, help="of experiments that repeat something at random")
-    parser.add_argument("--out", type=Path, help=f"folder (default: {RESULTS}; with --quick {QUICK})")
+    parser.add_argument(
+        "--rows", default="", metavar="A,B", help="of an experiment of several rows (belief) only these"
+    )
+    parser.add_argument("--out", type=Path, help=f"folder (default: {RESULTS}; with --quick {QUICK}, --rows {ROWS})")
     options = parser.parse_args(arguments)
     unknown = set(options.only or ()) - set(EXPERIMENTS)
     if unknown:
@@ -117,7 +124,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     if options.jobs < 1:
         parser.error(f"--jobs {options.jobs}: at least one process is needed")
     options.names = options.only or list(EXPERIMENTS)
-    options.out = options.out or (QUICK if options.quick else RESULTS)
+    options.out = options.out or (QUICK if options.quick else ROWS if options.rows else RESULTS)
     whole = [
         name for name in options.names if options.quick and kept(options.out / f"{name}.json").get("quick") is False
     ]

@@ -27,6 +27,7 @@ from estimator.pipeline import Settings, new_state, step
 from estimator.pipeline import State as EstimatorState
 from estimator.stored_map import image_of, restored
 from hal.adc import AdcStatus, Blemish, RawSamples
+from hal.imu import RawImu
 from hal.lidar import VALID, LidarGeometry, LidarStatus, Link, RawScan
 from hal.odometry import RawOdometry
 from tools.experiments.integrity.scene import FIRST_S, Scenario
@@ -88,6 +89,8 @@ class Robot:
         inbox = self.cycle.inbox
         if isinstance(thing, RawOdometry):
             inbox.put_odometry(thing)
+        elif isinstance(thing, RawImu):
+            inbox.put_imu(thing)
         elif isinstance(thing, LightEpoch):
             assert self.decoded is not None
             seq, watch = len(self.decoded.waiting) + self.cycle.blocks + 1000, self.cycle.parts.blocks
@@ -141,7 +144,7 @@ def scans(scene: Scenario) -> Iterator[RawScan]:
     def lidar(at: Array) -> Array:
         T = scene.pose(at)
         c, s = np.cos(T[:, 2]), np.sin(T[:, 2])
-        return np.column_stack([T[:, 0] + c * MOUNT[0], T[:, 1] + s * MOUNT[0], T[:, 2]])
+        return np.column_stack([T[:, 0] + c * MOUNT[0], T[:, 1] + s * MOUNT[0], T[:, 2] + scene.turned(at)])
 
     for k in range(int((scene.seconds - sweep_s) / PERIOD_S)):
         t = k * PERIOD_S
@@ -182,11 +185,12 @@ def run(scene: Scenario) -> Array:
         snapshot = robot.take(arrived)
         if snapshot is not None and snapshot.pose is not None:
             true = se2.between(start, scene.pose(np.array([snapshot.t_mono]))[0])
-            rows.append(_row(snapshot, true))
+            rows.append(row(snapshot, true))
     return np.array(rows)
 
 
-def _row(snapshot: Snapshot, true: Array) -> list[float]:
+def row(snapshot: Snapshot, true: Array) -> list[float]:
+    """One row of a track: a snapshot with a pose, against the truth."""
     assert snapshot.pose is not None
     e = np.array(snapshot.pose) - true
     e[2] = se2.wrap(float(e[2]))

@@ -50,6 +50,7 @@ class Scenario:
         ceilings: (from when, lamps that shine from then on). told: what the robot knows of them.
         blind, dark: (from, to) when the lidar, the photodiode is covered.
         recoverable: (from, to) when the right place could be known. clean: nothing goes wrong at all.
+        mount: from when the lidar's mount is turned: by an angle (rad) at once, and on by a rate (rad/s).
         restarts: when the daemon is switched off and on again with the map that it has made.
     """
 
@@ -67,6 +68,7 @@ class Scenario:
     dark: tuple[tuple[float, float], ...] = ()
     recoverable: tuple[tuple[float, float], ...] = ()
     clean: bool = False
+    mount: tuple[float, float, float] = (np.inf, 0.0, 0.0)
     restarts: tuple[float, ...] = ()
     seconds: float = SECONDS
     notes: dict[str, object] = field(default_factory=dict)
@@ -86,6 +88,11 @@ class Scenario:
                     share = ((t[between] - before.end) / (leg.begin - before.end))[:, None]
                     out[between] = ends[0] + share * (ends[1] - ends[0])
         return out
+
+    def turned(self, t: Array) -> Array:
+        """(n,) yaw of the lidar less that of its configured mount, rad."""
+        since, angle, rate = self.mount
+        return np.where(t >= since, angle + rate * np.maximum(t - since, 0.0), 0.0)
 
     def tilt(self, t: float) -> tuple[float, float]:
         """Pitch and roll of the scan plane."""

@@ -94,12 +94,14 @@ class Work:
         jobs: processes; 1 runs everything here, in order, which is also what a debugger wants.
         progress: whether to write to stderr at all.
         trials: how many an experiment that repeats something at random is to make; 0: as many as it thinks fit.
+        rows: those that an experiment of several rows is to make; empty: all.
     """
 
-    def __init__(self, jobs: int = 1, progress: bool = False, trials: int = 0) -> None:
+    def __init__(self, jobs: int = 1, progress: bool = False, trials: int = 0, rows: tuple[str, ...] = ()) -> None:
         if jobs < 1:
             raise ValueError(f"jobs = {jobs}: at least one process is needed")
-        self.jobs, self.progress, self.trials, self._shown_at = jobs, progress, trials, -math.inf
+        self.jobs, self.progress, self.trials, self.rows = jobs, progress, trials, rows
+        self._shown_at = -math.inf
 
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], label: str = "", keep: Path | None = None

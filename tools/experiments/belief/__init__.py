@@ -1,0 +1,1 @@
+"""What the belief in the place is worth: real drives, spoiled ones, sensors that lie, constants."""
