@@ -18,10 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from tools.bench.vm import whole
 from tools.bench.vm.image import Image, Say
 from tools.bench.vm.machine import Order, Ports, Start, all_well, command_line, free_for_both, free_port, started
-from tools.bench.vm.places import CannotBench, clear, remedy, workspace
+from tools.bench.vm.places import CannotBench, clear, missing_of, remedy, workspace
 
 ROOM: Final = 2_000_000_000
 QEMU: Final = "qemu-system-x86_64"
@@ -57,8 +56,8 @@ class Booted:
         return float(json.loads((self.folder / "told.json").read_text())["seconds"])
 
     def lacks(self) -> str:
-        """What is missing or other than it was kept; empty text: it is whole."""
-        return whole.lacks(self.folder, self.parts)
+        """What is missing or empty; empty text: it is whole."""
+        return missing_of(self.parts)
 
     @property
     def parts(self) -> tuple[Path, ...]:
@@ -89,7 +88,6 @@ def booted(image: Image, say: Say) -> Booted:
             part.mkdir()
             seconds = _boot(folder, Booted(image, part))
         (part / "told.json").write_text(json.dumps({"seconds": seconds}))
-        whole.note(part, Booted(image, part).parts)
         part.replace(made.folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)

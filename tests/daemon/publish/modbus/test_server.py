@@ -96,7 +96,7 @@ def test_pymodbus_commands_and_writes_odometry(kind: type[Client]) -> None:
     with_client(kind, body, write=True, on_command=commands.append, on_odometry=readings.append)
 
 
-def test_eight_udp_clients_back_to_back() -> None:
+async def test_eight_udp_clients_back_to_back() -> None:
     async def client(port: int, number: int, rounds: int) -> None:
         async with udp_client(port) as (transport, datagrams):
             for index in range(rounds):
@@ -105,12 +105,9 @@ def test_eight_udp_clients_back_to_back() -> None:
             await asyncio.sleep(0.02)  # a second answer to one request would come now
             assert [a[:2] for a in datagrams.answers] == [(number << 12 | i).to_bytes(2, "big") for i in range(rounds)]
 
-    async def run() -> None:
-        async with publishing() as publisher:
-            await asyncio.gather(*(client(publisher.port, number, 200) for number in range(8)))
-            assert publisher.counts.requests == 8 * 200
-
-    asyncio.run(run())
+    async with publishing() as publisher:
+        await asyncio.gather(*(client(publisher.port, number, 200) for number in range(8)))
+        assert publisher.counts.requests == 8 * 200
 
 
 async def test_a_burst_of_datagrams_from_eight_clients() -> None:
