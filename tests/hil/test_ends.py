@@ -11,7 +11,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from tests.hil.programs import ROOT, free_port, served_lidar, served_receiver
+from tests.hil.programs import ROOT, served_lidar, served_receiver
+from tools.sim.ports import free_port
 
 ON_DEVICES = 8
 """Tests of the lidar that need no minutes, and the probe."""

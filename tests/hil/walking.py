@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.hil.ends import Operator
-from tests.hil.programs import Served, daemon, free_port, process
+from tests.hil.programs import Served, daemon, process
+from tools.sim.ports import free_port
 from tools.sim.robot.drive import Body
 
 SIMULATED_S: Final = 30.0

@@ -25,7 +25,7 @@ from urllib.request import urlopen
 import pytest
 
 from tests.taps.documented import ELSEWHERE, NOT_RUN, ROOT, RUN, all_documented, to_run
-from tests.taps.routers import free_port
+from tools.sim.ports import free_port
 
 AT = "%H:%M:%S"
 SHORTER = {"--seconds": "2", "--journal-at": "2"}

@@ -22,15 +22,8 @@ from typing import Any, Final
 from aiohttp import ClientSession, ClientWebSocketResponse
 
 from daemon.publish.modbus.client import Reader
-from tools.demo.run import (
-    Patience,
-    free_port,
-    running,
-    simulator_words,
-    wait_for_pose,
-    wait_for_simulator,
-    write_config,
-)
+from tools.demo.run import Patience, running, simulator_words, wait_for_pose, wait_for_simulator, write_config
+from tools.sim.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -22,12 +22,12 @@ from tools.demo.run import (
     SURVEY,
     DemoError,
     Patience,
-    free_port,
     running,
     wait_for_pose,
     wait_for_simulator,
     write_config,
 )
+from tools.sim.ports import free_port
 from tools.soak.watched import Watch
 
 ROW_S: Final = 20.0

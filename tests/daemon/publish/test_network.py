@@ -33,14 +33,9 @@ from hal.fake.lidar.scan_world import Room
 from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inet import numeric
 from hal.net.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, encode
+from tools.sim.ports import free_port
 
 T = TypeVar("T")
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 async def outside(work: Callable[[], T]) -> T:

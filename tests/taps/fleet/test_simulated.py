@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
-from tests.taps.routers import free_port
+from tools.sim.ports import free_port
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 150.0

@@ -6,7 +6,6 @@ import asyncio
 import json
 import math
 import re
-import socket
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -23,18 +22,13 @@ from taps.metrics.metrics import Latest, exposition
 from taps.metrics.server import serve
 from taps.metrics.vda5050 import position, position_v2
 from tests.taps.serving import served
+from tools.sim.ports import free_port
 
 families = pytest.importorskip("prometheus_client.parser").text_string_to_metric_families
 POSE = Pose(
     seq=1, t_mono=1.0, t_sent=1.0, t_utc=1.7e9, state=3, state_name="TRACKING", reason=0, pose=(1.0, 2.0, 7.0),
     map_id=255, covariance=(1.0, 0.0, 1.0, 0.0, 0.0, 1.0),
 )  # fmt: skip
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 async def ask(port: int, request: bytes) -> bytes:

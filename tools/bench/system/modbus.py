@@ -26,6 +26,7 @@ from daemon.snapshot import Snapshot, State
 from hal.clock import SystemClock
 from tools.bench.support.children import child, ended, lines
 from tools.ci.figures import Figure, bounded, table
+from tools.sim.ports import free_port
 
 COMMAND: Final = "python -m tools.bench.system.modbus"
 PEER: Final = f"pymodbus {pymodbus.__version__} server"
@@ -79,13 +80,6 @@ async def serve() -> None:
     for server in servers:
         await server.shutdown()
     await asyncio.gather(*running, return_exceptions=True)
-
-
-def free_port() -> int:
-    """A port that is free on TCP (pymodbus does not tell which one it got)."""
-    with socket.socket() as sock:
-        sock.bind((_HOST, 0))
-        return int(sock.getsockname()[1])
 
 
 @contextmanager

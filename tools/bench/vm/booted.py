@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Final
 
 from tools.bench.vm.image import Image, Say
-from tools.bench.vm.machine import Order, Ports, Start, all_well, command_line, free_for_both, free_port, started
+from tools.bench.vm.machine import Order, Ports, Start, all_well, command_line, started
 from tools.bench.vm.places import CannotBench, clear, missing_of, remedy, workspace
+from tools.sim.ports import free_port
 
 ROOM: Final = 2_000_000_000
 QEMU: Final = "qemu-system-x86_64"
@@ -100,7 +101,7 @@ def _boot(folder: Path, made: Booted) -> float:
     done = subprocess.run(disk, capture_output=True, text=True)
     if done.returncode:
         raise CannotBench(f"making room for what the first boot writes failed: {done.stderr}")
-    ports = Ports(free_for_both(), free_port(), free_port())
+    ports = Ports(free_port(), free_port(), free_port())
     with started(Start(made.image, made.disk, keep=True), folder, ports, threading.Event()) as machine:
         begun = time.monotonic()
         try:

@@ -76,14 +76,9 @@ def main(name: str, path: str) -> None:
     figure.savefig(path, dpi=80)
 
 
-def asked(program: str, about: str) -> tuple[str, str]:
-    """Building and file of the command line; what is wrong with it ends the program with a sentence."""
-    parser = argparse.ArgumentParser(prog=f"python -m {program}", description=about.splitlines()[0])
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(prog="python -m tools.sim.building.draw", description=__doc__.splitlines()[0])
     parser.add_argument("building", choices=sorted(BUILDINGS))
     parser.add_argument("picture", help="file to write, *.png")
     options = parser.parse_args()
-    return options.building, options.picture
-
-
-if __name__ == "__main__":
-    main(*asked("tools.sim.building.draw", __doc__))
+    main(options.building, options.picture)
