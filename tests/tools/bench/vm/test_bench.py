@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
-import threading
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
-from tools.bench.report.result import Seen
-from tools.bench.vm import bench, common, image, places, trying_system
-from tools.bench.vm.bench import Bench, Ears, Heard
+from tools.bench.vm import bench, common, image, places
 from tools.bench.vm.guests import tried
 from tools.bench.vm.scenarios import SCENARIOS
 
@@ -98,47 +91,3 @@ def test_a_daemon_that_dies_unnoticed_fails_the_scenario(
     assert result.passed is as_wanted
     assert as_wanted or result.said.startswith("the daemon has died unnoticed: process ")
     assert lived.life == after
-
-
-def inside(run: Any = None, waited: float = 0.0) -> Bench:
-    """One that answers commands by ``run``, and has waited for a processor so long whenever it is asked again."""
-    told = iter([10.0, 10.0 + waited])
-    machine = SimpleNamespace(run=run, waited_s=lambda: next(told), broken_off=threading.Event())
-    bench = Bench.__new__(Bench)
-    bench.machine, bench.ears, bench.memory = machine, Ears(), {}  # type: ignore[assignment]  # all that is asked
-    return bench
-
-
-def poses(count: int) -> list[Heard]:
-    return [Heard(0.2 * k + 0.04, 0.2 * k, 3, (0.1 * k, 0.0, 0.0), 0.01) for k in range(count)]
-
-
-def driven() -> Bench:
-    """One that has heard the truth."""
-    bench = inside()
-    bench.ears.truth.extend((0.05 * k, (0.025 * k, 0.0, 0.0)) for k in range(2000))
-    return bench
-
-
-@pytest.mark.parametrize(("degraded", "off", "right"), [(4, 0.0, True), (8, 0.0, False), (0, 0.2, False)])
-def test_a_drive_is_tracking_and_right_and_is_shown_where_it_is_not(
-    degraded: int, off: float, right: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    bench = driven()
-    bench.folder = tmp_path
-    heard = [replace(one, pose=(0.1 * k, off, 0.0), state=3 if k >= degraded else 4) for k, one in enumerate(poses(51))]
-    bench.start = (0.0, 0.0, 0.0)
-    for name, made in (
-        ("drive", lambda: None), ("until", lambda *_: 0.0), ("collect", lambda seconds: heard),
-        ("placed", lambda *_: 0.0),
-    ):  # fmt: skip
-        monkeypatch.setattr(bench, name, made)
-    if right:
-        assert isinstance(trying_system.drives(bench), Seen)
-        kept = json.loads((tmp_path / "drive").read_text())
-        assert kept["poses"][3][1:3] == [pytest.approx(0.6), [pytest.approx(0.3), 0.0, 0.0]]
-        assert kept["truth"][12] == [pytest.approx(0.6), [pytest.approx(0.3), 0.0, 0.0]]
-        return
-    with pytest.raises(common.Unmet, match=r"TRACKING for 84 % of 51 poses|0\.200 m from the truth") as unmet:
-        trying_system.drives(bench)
-    assert [plot.title for plot in unmet.value.seen.plots] == ["trajectory", "age of a pose that comes"]
