@@ -33,7 +33,7 @@ as long, and reach hardly one that the other tests do not (see `tools.ci.floors`
 row without the compiler."""
 
 FIRST = (
-    "tools/test_soak.py",
+    "tools/test_programs.py",
     "faults/test_matrix.py",
     "systemd/test_container.py",
     "tools/experiments/integrity/test_campaign.py",

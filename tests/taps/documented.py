@@ -43,19 +43,19 @@ ELSEWHERE: Final = {
     r"formats.md: lumiloop export torn": "tests/taps/test_docs.py::test_the_exports_of_the_documents",
     r"installation.md: lumiloop doctor": "tests/taps/test_docs.py::test_the_doctor_of_the_documents",
     r".*: lumiloop probe": "tests/daemon/cli/test_probe.py",
-    r"calibration.md: lumiloop (survey|calibrate)": "tests/daemon/commissioning/test_teach_drive.py",
+    r"calibration.md: lumiloop (survey|calibrate)": "tests/daemon/commissioning/test_reach.py",
     r".*: make install": "tests/systemd/test_container.py",
     r"README.md: make demo|(start-demo|simulator).md: lumiloop demo|simulator.md: python -m tools.demo": (
         "tests/tools/demo/test_run.py"
     ),
     r"fake-devices.md: (python -m hal.fake --model|lumiloop run)": "tests/daemon/processes/test_process.py",
-    r"fake-devices.md: python -m hal.fake.adc.receiver": "tests/hal/fake/adc/test_receiver_process.py",
+    r"fake-devices.md: python -m hal.fake.adc.receiver": "tests/hal/fake/adc/test_receiver.py",
     r"bench.md: python -m tools.bench.world lap --local": "tests/tools/bench/world/test_world.py",
     r".*: (python -m tools.experiments|make experiments)": "tests/tools/experiments",
     r"data.md: python -m tests.logs": "tests/logs",
     r"README.md: make docs": "tests/tools/docs/test_site.py",
     r"replay.md: lumiloop dump": (
-        "tests/daemon/replay/test_recorded_process.py::test_a_dump_is_asked_for_as_the_page_says"
+        "tests/daemon/replay/test_recorded_map.py::test_a_dump_is_asked_for_as_the_page_says"
     ),
     r"control.md: lumiloop": "tests/daemon/cli/orders/test_give.py",
     r"map-files.md: lumiloop switch-map": "tests/daemon/cli/orders/test_give.py",

@@ -1,10 +1,14 @@
-"""Sockets get half of the loop's time, and everything that waited is served afterwards."""
+"""Addresses, and the share that each of them has."""
 
 from __future__ import annotations
 
 import asyncio
 import socket
 
+import pytest
+
+from hal.errors import DeviceMissing
+from hal.net import inet
 from hal.net.fair_share import PART, SLICE_S, Reader, Share
 
 
@@ -105,3 +109,21 @@ async def test_closing_while_waiting_ends_it() -> None:
     await asyncio.sleep(2 * SLICE_S)
     ours.close()
     theirs.close()
+
+
+@pytest.mark.parametrize("name", ["robot..local", ".local", f"{64 * 'a'}.local"])
+def test_what_cannot_be_a_name_is_missing(name: str) -> None:
+    assert inet.numeric(name, 5000) == []
+    with pytest.raises(DeviceMissing, match=r"not a host name .*63 characters"):
+        asyncio.run(inet.resolve(name, 5000))
+
+
+def test_an_interface_that_is_not_there_is_told_where_they_cannot_be_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without netlink sockets, which the service manager may forbid."""
+
+    def forbidden() -> None:
+        raise OSError(97, "Address family not supported by protocol")
+
+    monkeypatch.setattr(socket, "if_nameindex", forbidden)
+    with pytest.raises(DeviceMissing, match=r"no network interface wlan77 .*ip link"):
+        asyncio.run(inet.resolve("fe80::1%wlan77", 5000))

@@ -1,14 +1,16 @@
-"""Every command in every state, for both dialects, against a table written down from the specifications."""
+"""States of the fake lidar, and the world that it scans."""
 
 from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import UST_10LX, UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.scan_world import Room
 from tests.hal.fake.bench import Talk, virtual
 
 UST = replace(UST_10LX, link="usb")  # so that the line can be opened while it starts
@@ -208,3 +210,17 @@ def test_a_host_that_leaves(link: str) -> None:
 
     after = virtual(scene, replace(UTM_30LX, link=link))  # type: ignore[arg-type]  # a str of the three
     assert after is (State.IDLE if link == "ethernet" else State.MULTI)
+
+
+def test_room_is_seen_as_it_is() -> None:
+    """The back wall and the right-hand wall, as the sensor sees them from where it is."""
+    room = Room(UTM_30LX, noise_mm=0.0)
+    scan = room(0.0)
+    x, y, heading = room.pose(np.array([540 / 1440 * UTM_30LX.true_period_s]))[0]
+    assert heading == pytest.approx(np.pi / 2, abs=0.01)  # looking along +y
+    ahead, right = scan.ranges_mm[540], scan.ranges_mm[540 - 360]
+    assert ahead == pytest.approx(1e3 * (5.0 - y), abs=5)
+    assert right == pytest.approx(1e3 * (7.0 - x), abs=5)
+    assert room(15.0).ranges_mm[540] != ahead
+    assert scan.ranges_mm.min() > 300
+    assert np.array_equal(Room(UTM_30LX, seed=3)(1.0).ranges_mm, Room(UTM_30LX, seed=3)(1.0).ranges_mm)
