@@ -13,7 +13,7 @@ from hal.clock import VirtualLoop
 from hal.net.fair_share import Share
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import plugged
-from tests.fuzz.test_datagrams import check_answer, framed, responder, whole_frames
+from tests.fuzz.test_modbus import check_answer, framed, responder, whole_frames
 
 MEGABYTES = 10
 

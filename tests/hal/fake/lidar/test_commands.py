@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hal.fake.lidar.models import MODELS, URG_04LX, UST_10LX, UTM_30LX, LidarModel, Unit
+from hal.fake.lidar.models import URG_04LX, UST_10LX, UTM_30LX, Unit
 from tests.hal.fake.bench import Talk, virtual
 
 
@@ -156,42 +156,6 @@ def test_urg_04lx_says_what_a_real_one_said() -> None:
     assert lines[4] == "SCSP:Initial(600[rpm])<-Default setting by user;A"
     assert lines[6] == "SBPS:19200[bps]<-Default setting by user;A"
     assert lines[8] == "STAT:Sensor works well.;8"
-
-
-@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_every_model_states_itself(model: LidarModel) -> None:
-    async def scene(talk: Talk) -> None:
-        pp = (await talk.one("PP")).pairs
-        keys = {"DMIN": "dmin", "DMAX": "dmax", "ARES": "ares", "AMIN": "amin", "AMAX": "amax", "AFRT": "afrt"}
-        assert {key: int(pp[key]) for key in keys} == {key: getattr(model, name) for key, name in keys.items()}
-        assert abs(60.0 / int(pp["SCAN"]) - model.true_period_s) < 0.01 * model.true_period_s
-        assert (await talk.one("VV")).pairs["PROD"] == model.prod
-        assert "MODL" in (await talk.one("II")).pairs
-        for name in ("MD", "MS", "ME", "ND", "NE"):
-            tail = f"{model.amin:04d}{model.amin:04d}00001"
-            expected = "00" if name in model.measures else "0E"
-            assert await talk.status(name + tail) == expected
-
-    virtual(scene, model)
-
-
-def test_new_baud_rate_after_the_reply() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        port = talk.port
-        assert port is not None
-        statuses = [await talk.status("SS115200")]
-        await talk.ask("VV", 0.0)
-        await asyncio.sleep(0.5)
-        assert talk.raw == b""  # what the host says at the old rate is noise to the sensor
-        port.set_baud(115200)
-        statuses.append(await talk.status("VV"))
-        statuses.append(await talk.status("RT"))  # keeps the rate
-        statuses.append(await talk.status("VV"))
-        statuses.append(await talk.status("RS"))  # back to the rate it has after power-on
-        assert talk.device.baud == 19200
-        return statuses
-
-    assert virtual(scene, URG_04LX) == ["00"] * 5
 
 
 def test_host_at_another_rate_hears_noise() -> None:

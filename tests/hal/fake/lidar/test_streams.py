@@ -26,15 +26,6 @@ def record(command: str, seconds: float, model: LidarModel = UTM_30LX, unit: Uni
     return virtual(scene, model, unit=unit)
 
 
-def test_ranges_arrive_as_the_world_made_them() -> None:
-    acknowledged, *scans = record("MD0000108000000;tag 1", 0.5)
-    assert (acknowledged.echo, acknowledged.status, acknowledged.lines) == ("MD0000108000000;tag 1", "00", [])
-    assert len(scans) == 19
-    for n, scan in enumerate(scans):
-        assert scan.echo == "MD0000108000000;tag 1"
-        assert scan.values() == [1000 + step + 2 * n for step in range(1081)]
-
-
 def test_part_of_the_steps() -> None:
     scan = record("MD0100010200001", 0.2)[1]
     assert scan.values() == [1100, 1101, 1102]
@@ -51,14 +42,6 @@ def test_countdown_and_end() -> None:
     virtual(scene)
     echoes = [reply.echo for reply in record("MD0000108000012;x", 1.0)]
     assert echoes == ["MD0000108000012;x"] + [f"MD00001080000{n:02d};x" for n in range(11, -1, -1)]
-
-
-@pytest.mark.parametrize("skip", [0, 1, 9])
-def test_skipped_scans(skip: int) -> None:
-    scans = record(f"MD0000108000{skip}00", 2.0)[1:]
-    ticks = np.diff([scan.tick for scan in scans])
-    assert len(scans) > 5
-    assert np.all(np.abs(ticks - 1e3 * PERIOD * (1 + skip)) < 1.0)
 
 
 def test_cluster_takes_the_nearest_that_is_no_error() -> None:
@@ -143,19 +126,6 @@ def test_ust_speaks_on_the_ticks_of_its_clock() -> None:
     virtual(scene, UST_10LX, unit=unit)
 
 
-def test_clock_gain() -> None:
-    slow, fast = (record("MD0540054200000", 100.0, STILL, Unit(clock_gain=gain))[-1].tick for gain in (-50e-6, 50e-6))
-    assert fast - slow == pytest.approx(10.0, abs=1.1)
-
-
-def test_stamp_wraps_at_24_bits() -> None:
-    ticks = [scan.tick for scan in record("MD0540054200000", 2.5, unit=Unit(clock_ms=16_776_000))[1:]]
-    (wrap,) = np.flatnonzero(np.diff(ticks) < 0)
-    assert ticks[wrap] >= (1 << 24) - 26
-    assert ticks[wrap + 1] < 26
-    assert np.all(np.abs(np.diff(np.unwrap(ticks, period=1 << 24)) - 1e3 * PERIOD) <= 1.0)
-
-
 def test_two_runs_give_the_same_bytes_and_instants() -> None:
     def run() -> list[tuple[float, bytes]]:
         async def scene(talk: Talk) -> list[tuple[float, bytes]]:
@@ -167,20 +137,6 @@ def test_two_runs_give_the_same_bytes_and_instants() -> None:
         return virtual(scene, unit=Unit(seed=7))
 
     assert run() == run()
-
-
-def test_rs232_is_as_slow_as_its_rate_and_loses_scans_inside() -> None:
-    async def scene(talk: Talk) -> tuple[int, int, list[float]]:
-        talk.say("MD0044072500000\n")
-        await asyncio.sleep(20.0)
-        scans = talk.scans()
-        assert all(scan.values()[0] == 1044 + 2 * (scan.values()[0] - 1044) // 2 for scan in scans)
-        return len(scans), talk.device.counts.lost_in_sensor, [scan.t for scan in scans]
-
-    count, lost, times = virtual(scene, MODELS["URG-04LX"])
-    assert np.diff(times) == pytest.approx(2137 * 10 / 19200)
-    assert count == 17
-    assert lost > 150
 
 
 def test_quit_lets_at_most_the_scan_on_the_line_pass() -> None:
