@@ -1,6 +1,6 @@
 """``python -m tests.estimator.target_poses``: what this machine code makes of a short drive, as JSON on stdout.
 
-Run in child processes by `test_jit_cache`, once for each way of compiling the kernels.
+Run in child processes by `test_jit_targets`, once for each way of compiling the kernels.
 """
 
 from __future__ import annotations

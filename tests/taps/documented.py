@@ -49,7 +49,7 @@ ELSEWHERE: Final = {
         "tests/tools/demo/test_run.py"
     ),
     r"fake-devices.md: (python -m hal.fake --model|lumiloop run)": "tests/daemon/processes/test_process.py",
-    r"fake-devices.md: python -m hal.fake.adc.receiver": "tests/hal/fake/adc/test_receiver.py",
+    r"fake-devices.md: python -m hal.fake.adc.receiver": "tests/hal/fake/adc/test_receiver_process.py",
     r"bench.md: python -m tools.bench.world lap --local": "tests/tools/bench/world/test_world.py",
     r".*: (python -m tools.experiments|make experiments)": "tests/tools/experiments",
     r"data.md: python -m tests.logs": "tests/logs",
