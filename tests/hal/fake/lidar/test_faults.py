@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -42,10 +41,6 @@ def test_dmax() -> None:
     assert read(text(order("dmax"), "PP")).pairs["DMAX"] == "262143"
 
 
-def test_trouble() -> None:
-    assert read(text(order("trouble"), "II")).pairs["STAT"] == "Trouble!! Error No. =[00->33]"
-
-
 def test_modem_manager() -> None:
     async def scene(talk: Talk) -> list[str]:
         talk.schedule.load(order("inject", when=0.1))
@@ -55,21 +50,6 @@ def test_modem_manager() -> None:
     replies = virtual(scene)
     assert replies.count("AT0E") == 1
     assert replies.count(MD + "99") == 19
-
-
-def test_scip1() -> None:
-    async def scene(talk: Talk) -> list[bytes]:
-        heard = []
-        talk.schedule.load(order("scip1"))
-        await asyncio.sleep(0.1)
-        for line in ("QT", "SCIP2.0", "VV"):
-            talk.pieces.clear()
-            talk.say(line + "\n")
-            await asyncio.sleep(0.1)
-            heard.append(talk.raw[:7])
-        return heard
-
-    assert virtual(scene) == [b"QT\nE\n\n", b"SCIP2.0", b"VV\n00P\n"]
 
 
 def test_baud_is_refused_where_there_is_no_line_rate() -> None:
@@ -107,51 +87,6 @@ def test_lifted_faults_leave_a_sound_stream(what: str) -> None:
         return sum(sound(data) for _, data in talk.pieces)
 
     assert virtual(scene) >= (0 if what == "baud" else 38)
-
-
-def ticks(toml: str) -> list[int]:
-    return [read(data).tick for data in pieces(toml)[1:]]
-
-
-def test_frozen_stamp() -> None:
-    got = [read(data) for data in pieces(order("frozen_stamp", when=0.2, **{"for": 0.3}))[1:]]
-    steps = np.diff([reply.tick for reply in got])
-    assert list(steps).count(0) in (11, 12)
-    assert steps.max() > 270  # afterwards the true stamps again
-    values = [reply.values()[0] for reply in got]
-    assert np.all(np.diff(values) == 2)
-
-
-@pytest.mark.parametrize("by_ms", [-5000, 40000])
-def test_stamp_jump(by_ms: int) -> None:
-    plain = ticks("")
-    got = ticks(order("stamp_jump", by_ms=by_ms, count=1))
-    assert got[0] == (plain[0] + by_ms) % (1 << 24)
-    assert got[1:] == plain[1:]
-
-
-def test_set_clock() -> None:
-    got = ticks(order("set_clock", when=0.5))
-    jump = int(np.argmax(np.abs(np.diff(got))))
-    assert 0.4 < jump * PERIOD < 0.6
-    assert got[jump + 1] > 16_776_000 - 30
-    assert got[-1] < 16_776_000 + 600
-
-
-def test_stuck() -> None:
-    got = pieces(order("stuck", when=0.2, **{"for": 0.3}))[1:]
-    same = sum(a == b for a, b in pairwise(got))
-    assert same in (11, 12)
-    assert all(sound(data) for data in got)
-
-
-@pytest.mark.parametrize("value", [*range(20), 65533])
-def test_codes(value: int) -> None:
-    reply = read(pieces(order("codes", value=value, beams=0.5, count=1), 0.2)[1])
-    values = np.array(reply.values())
-    hit = values == value
-    assert 450 < hit.sum() < 630
-    assert np.all(values[~hit] == (1000 + np.arange(1081))[~hit])
 
 
 def test_wrong() -> None:
