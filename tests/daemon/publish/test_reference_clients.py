@@ -22,7 +22,7 @@ from hal.clock import SystemClock
 from hal.imu import RawImu
 from hal.net.inputs import InputPort
 from hal.odometry import RawOdometry
-from tests.daemon.publish.modbus.test_lights_block import picture
+from tests.daemon.publish.modbus.test_light_blocks import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import publishing, until
 from tools.clients import read_lights, read_modbus, send_command, send_odometry, subscribe_pose

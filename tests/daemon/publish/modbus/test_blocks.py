@@ -15,12 +15,12 @@ from daemon.publish.modbus import dimmed_block, integrity_block, lights_block, p
 from daemon.publish.modbus.points import Layout
 from daemon.publish.modbus.requests import BLOCKS, Responder
 from daemon.snapshot import LightFix, LinkUse, LoopReason, Part, Snapshot, Stage, Thread
-from tests.daemon.publish.modbus.test_dimmed_block import DIMMED
-from tests.daemon.publish.modbus.test_integrity_block import TRUST
-from tests.daemon.publish.modbus.test_lights_block import picture
-from tests.daemon.publish.modbus.test_parts_block import CONDITION
+from tests.daemon.publish.modbus.test_light_blocks import DIMMED
+from tests.daemon.publish.modbus.test_state_blocks import TRUST
+from tests.daemon.publish.modbus.test_light_blocks import picture
+from tests.daemon.publish.modbus.test_state_blocks import CONDITION
 from tests.daemon.publish.modbus.test_registers import snapshot
-from tests.daemon.publish.modbus.test_timing_block import PULSE
+from tests.daemon.publish.modbus.test_state_blocks import PULSE
 
 FROZEN = Path(__file__).parent / "frozen"
 
