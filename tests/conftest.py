@@ -1,7 +1,5 @@
 """Options shared by all tests: which device end to use, and where real logs are."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib

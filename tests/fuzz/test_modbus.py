@@ -1,7 +1,5 @@
 """Bytes that nobody should send: never an exception, always a well-formed answer or none."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 

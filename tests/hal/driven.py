@@ -1,7 +1,5 @@
 """What the benches of drivers share: a driver that runs for a while, and coroutine tests that a bench plays."""
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import inspect

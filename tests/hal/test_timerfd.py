@@ -1,7 +1,5 @@
 """The kernel's timer and the loop's do the same: once, at the instant, the latest order counts."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Programs of their own: the shipped one, and the fakes where they have to be other processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

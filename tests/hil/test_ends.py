@@ -1,7 +1,5 @@
 """The device suite on fakes in other processes, and where a device is missing."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

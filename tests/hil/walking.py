@@ -1,7 +1,5 @@
 """A walk: somebody drives the robot about while the shipped program records; a simulated robot where there is none."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

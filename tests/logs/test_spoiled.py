@@ -1,7 +1,5 @@
 """A real drive, spoiled as robots in the field spoil theirs: while wheels are right, the place is never given up."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The unit files as they are shipped: valid, hardened, and free of what would break the compiler."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Every command that stands in a block of code of the documents, and how it is known to do what is said of it."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

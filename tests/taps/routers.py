@@ -1,7 +1,5 @@
 """A Zenoh router for tests, which can be ended and begun again."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from argparse import Namespace

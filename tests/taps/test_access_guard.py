@@ -1,7 +1,5 @@
 """Who may look, and who may order."""
 
-from __future__ import annotations
-
 import asyncio
 import subprocess
 import sys

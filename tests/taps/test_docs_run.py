@@ -4,8 +4,6 @@ Only places are other ones (a folder of the test's own, this computer in place o
 times are shorter. What is run elsewhere, or cannot be run, is said in `tests.taps.documented`, with the reason.
 """
 
-from __future__ import annotations
-
 import gzip
 import itertools
 import os

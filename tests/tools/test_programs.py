@@ -1,7 +1,5 @@
 """Programs of the tools: modules can be imported, clients say how they are used, a soak sees growth."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import subprocess

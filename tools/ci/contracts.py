@@ -9,8 +9,6 @@ A contract breaks only under a new version number of its own. What is new since 
 unnoticed: it is written down beside it. Only tables are read here, nothing runs.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

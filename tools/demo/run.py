@@ -8,8 +8,6 @@ do the same at any time. At the end map, recording and configuration lie in a fo
 nothing is left running.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib.util

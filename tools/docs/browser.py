@@ -1,7 +1,5 @@
 """A simulated robot, its daemon and a page of it as processes; Debian's chromium, driven over its own protocol."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import base64

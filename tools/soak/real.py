@@ -1,7 +1,5 @@
 """Hours of the real processes: the daemon, which keeps maps and a recording, and the demo's simulator, in real time."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

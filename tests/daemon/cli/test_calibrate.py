@@ -1,7 +1,5 @@
 """The commands `calibrate` and `survey`: what they say, write and refuse; drives are made without a recording here."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`lumiloop check`: a good file, a bad survey, and a bus that is not here."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

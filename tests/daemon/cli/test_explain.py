@@ -1,7 +1,5 @@
 """`lumiloop explain`: everything that has a name or a number can be asked about, and is found."""
 
-from __future__ import annotations
-
 import json
 import re
 from enum import IntEnum

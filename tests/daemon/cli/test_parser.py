@@ -1,7 +1,5 @@
 """The command line's own behaviour: dispatch, exit codes, and that refusals are text, not tracebacks."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """`lumiloop replay` and `lumiloop map export` from the command line: results, repeatability, bad input."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import json

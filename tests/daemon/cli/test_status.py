@@ -1,7 +1,5 @@
 """`lumiloop status` against a running publisher, a silent host, a stranger."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import json

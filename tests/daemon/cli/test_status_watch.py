@@ -1,7 +1,5 @@
 """`lumiloop status --watch`: what is shown anew, and for how long."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

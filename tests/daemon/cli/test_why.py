@@ -1,7 +1,5 @@
 """`lumiloop why`: the command with real recordings, what it says of them and draws, and what it refuses."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Planning lamps: what is predicted against what the estimator's own model and solver do, and plans against rivals."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """Floor that a robot reaches, and a survey from a recorded drive."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Parts that fail are restarted, ever more slowly; loss and return are said once."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable

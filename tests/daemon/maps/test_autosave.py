@@ -1,7 +1,5 @@
 """Maps saved by themselves: when, and what follows where their folder cannot be used."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import logging

@@ -1,7 +1,5 @@
 """Nothing good is deleted, and a stored map without a place in the survey is kept and named."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import os

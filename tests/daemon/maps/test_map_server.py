@@ -1,7 +1,5 @@
 """Maps of a map server: cells, frames, and the description beside them."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from pathlib import Path

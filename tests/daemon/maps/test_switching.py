@@ -1,7 +1,5 @@
 """SWITCH_MAP: the whole daemon goes on in another stored map, found in it by itself, and the replay repeats it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Callable

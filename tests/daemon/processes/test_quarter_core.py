@@ -1,7 +1,5 @@
 """The real program under load: 1081 beams at 40 Hz, 41 coded lamps and wheels, with a quarter of one core to itself."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

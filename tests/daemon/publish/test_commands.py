@@ -1,7 +1,5 @@
 """Commands: their order and outcome in the daemon, and the local socket that takes them."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

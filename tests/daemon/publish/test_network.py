@@ -1,7 +1,5 @@
 """ActiveFaults and odometry that come in over Modbus and UDP, through real sockets to the estimate and back."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

@@ -1,7 +1,5 @@
 """The reference clients against the daemon's own ends: written from the documents, they share no code with it."""
 
-from __future__ import annotations
-
 import asyncio
 import shutil
 import socket

@@ -1,7 +1,5 @@
 """Pose datagrams by subscription: the bytes, the leases, the cookie, and real sockets."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import socket

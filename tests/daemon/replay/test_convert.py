@@ -1,7 +1,5 @@
 """Recorded data of other formats become logs that say the same."""
 
-from __future__ import annotations
-
 import gzip
 import math
 from pathlib import Path

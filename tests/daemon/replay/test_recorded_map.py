@@ -1,7 +1,5 @@
 """Recorded runs with a map, with a change of maps, and of a real process: the replay repeats them."""
 
-from __future__ import annotations
-
 import json
 import logging
 import subprocess

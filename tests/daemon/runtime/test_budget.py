@@ -1,7 +1,5 @@
 """The cycle's budget, and the levels of degradation where it does not suffice."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

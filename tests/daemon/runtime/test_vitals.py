@@ -1,7 +1,5 @@
 """What the process measures of itself, and what a snapshot contains of guesses and loops."""
 
-from __future__ import annotations
-
 import errno
 import io
 import logging

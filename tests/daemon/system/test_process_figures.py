@@ -1,7 +1,5 @@
 """Figures of the process and its limit of memory."""
 
-from __future__ import annotations
-
 import errno
 import os
 import resource

@@ -1,7 +1,5 @@
 """Standard streams that are closed, and the socket of the service manager."""
 
-from __future__ import annotations
-
 import errno
 import os
 import socket

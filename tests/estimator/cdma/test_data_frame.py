@@ -1,7 +1,5 @@
 """Data frames of lamps: coded, accumulated and decoded."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 

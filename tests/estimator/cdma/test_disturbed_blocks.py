@@ -1,7 +1,5 @@
 """Blocks in which the bus stalls or the converter saturates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

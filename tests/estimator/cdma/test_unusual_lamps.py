@@ -1,7 +1,5 @@
 """Lamps with slow edges, and two lamps of one code."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

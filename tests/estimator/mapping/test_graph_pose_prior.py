@@ -1,7 +1,5 @@
 """Priors of poses in the graph, and the graph when it is made sparse."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pose graph: its minimum, its steps along the spanning tree, and its limits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

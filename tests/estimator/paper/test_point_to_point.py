@@ -1,7 +1,5 @@
 """Scan matching as printed: point-to-point (Eq. 13) and PIC."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

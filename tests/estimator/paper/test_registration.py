@@ -1,7 +1,5 @@
 """The paper's registration of scans, from its first transform on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

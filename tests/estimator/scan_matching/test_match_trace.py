@@ -1,7 +1,5 @@
 """What a match leaves behind: its trace and its evidence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """I2C messages, and the frames that carry them to another process."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 from itertools import pairwise

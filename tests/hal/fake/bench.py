@@ -3,8 +3,6 @@
 The reader is a third implementation of the protocol, strict and slow; it shares nothing with the encoder or the driver.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Helpers of real-time tests of the fake lidar: a pty with its host, and waiting with slack for a busy computer."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Awaitable, Callable

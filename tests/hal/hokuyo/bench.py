@@ -1,7 +1,5 @@
 """A bench for driver tests: the fake sensor in virtual time, or the real one named by ``--lidar`` in real time."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractAsyncContextManager

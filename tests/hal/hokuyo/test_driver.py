@@ -1,7 +1,5 @@
 """The driver's conduct: finding the right sensor, waiting, telling people, stopping."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 

@@ -1,7 +1,5 @@
 """Data of the driver: ranges, intensities, stamps, and the words that are no distance."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Callable

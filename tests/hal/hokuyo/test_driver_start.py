@@ -1,7 +1,5 @@
 """Sensors that are not ready, deny what is not needed, or report themselves in unusual words: scans all the same."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The driver starts from any state a sensor can be in. Bodies without faults run on a real sensor too (--lidar)."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Models of the sensor, and the errors that they report."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

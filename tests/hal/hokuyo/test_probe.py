@@ -1,7 +1,5 @@
 """Probing: every port says who is there or why not, and sensors are left as they should be."""
 
-from __future__ import annotations
-
 import asyncio
 from pathlib import Path
 

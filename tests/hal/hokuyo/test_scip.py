@@ -1,7 +1,5 @@
 """SCIP: lines, checksums and replies."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 from collections.abc import Awaitable, Callable

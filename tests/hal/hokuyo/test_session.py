@@ -1,7 +1,5 @@
 """The session against a sensor that says exactly what a script tells it to, word by word."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
 

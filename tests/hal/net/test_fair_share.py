@@ -1,7 +1,5 @@
 """Addresses, and the share that each of them has."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 

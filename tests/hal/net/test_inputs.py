@@ -1,7 +1,5 @@
 """Odometry and IMU datagrams: bytes by hand, damage, order, restarts, two senders, times."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

@@ -1,7 +1,5 @@
 """A bench for converter tests: the fake in virtual time, or the real one named by ``--adc`` in real time."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractAsyncContextManager

@@ -1,7 +1,5 @@
 """The DC channel: dark, dazzled and dead told apart; whatever happens to it, sampling goes on."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 

@@ -1,7 +1,5 @@
 """The driver's conduct while nothing is wrong; the first tests also run on a real converter (``--adc``)."""
 
-from __future__ import annotations
-
 import asyncio
 from itertools import pairwise
 

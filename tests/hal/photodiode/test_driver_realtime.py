@@ -1,7 +1,5 @@
 """The whole driver in real time: its thread, smbus2, and a model of the kernel under it."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import logging

@@ -1,7 +1,5 @@
 """The line format: fields, optional parts, and what is refused."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -3,8 +3,6 @@
 The robots' streams are served by this process; what joins, shares, fetches and looks are the commands themselves.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os

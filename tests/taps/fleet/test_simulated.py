@@ -1,7 +1,5 @@
 """Two simulated robots that share survey and map, as the page says it: word for word, but for the ports."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

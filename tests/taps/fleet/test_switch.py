@@ -1,7 +1,5 @@
 """A daemon is asked to go on in a map that was fetched: over its own Modbus server, as any client asks."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest

@@ -1,7 +1,5 @@
 """Metrics and position object: read by Prometheus' own parser and rules, and by the names of VDA 5050."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math

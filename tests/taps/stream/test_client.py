@@ -1,7 +1,5 @@
 """The taps' client of the local stream: against the daemon's own server, and against whoever else may answer."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import zlib

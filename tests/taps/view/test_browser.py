@@ -1,7 +1,5 @@
 """The page in a real browser: Debian's chromium, over the protocol of its developer tools, on a simulated robot."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import sys

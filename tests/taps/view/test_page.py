@@ -1,7 +1,5 @@
 """What the page shows and can do, in a real browser, at the sizes of a desktop and a phone, dark and light."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import csv

@@ -1,7 +1,5 @@
 """Where lamps hang and how the lidar sits: as the daemon that is watched has read it, not as an earlier one had."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from pathlib import Path

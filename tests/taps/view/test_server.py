@@ -1,7 +1,5 @@
 """The web page's server: what it serves, to whom, and for how many."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

@@ -1,7 +1,5 @@
 """Orders that browsers give the daemon: who may, and for which robot they are."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import subprocess

@@ -1,7 +1,5 @@
 """The verdicts of the benches: bounds, regressions, latency, architectures, and maps of real logs."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The demo: its verdict, a run from end to end, an interrupted run, and a daemon that dies."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

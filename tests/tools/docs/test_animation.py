@@ -1,7 +1,5 @@
 """The animation shows what was published, where the robot truly was, and when it was carried."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

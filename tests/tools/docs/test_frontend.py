@@ -1,7 +1,5 @@
 """The figures of docs/receiver.md and docs/transmitter.md are those of the calculator, and the calculator is right."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 from pathlib import Path

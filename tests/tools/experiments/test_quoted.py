@@ -1,7 +1,5 @@
 """The program of the experiments, and the numbers that pages quote of their results."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

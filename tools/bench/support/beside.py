@@ -3,8 +3,6 @@
 python -m tools.bench.support.beside STREAM     connections that want every topic and read nothing, until killed
 """
 
-from __future__ import annotations
-
 import signal
 import socket
 import sys

@@ -10,8 +10,6 @@ for a while it runs *alone* and *loaded*: readers and a stuck client (the parent
 being solved without a pause (its own).
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import logging

@@ -15,8 +15,6 @@ counts for neither.
 ``python -m tools.bench.system.latency --turns 30`` (16 minutes each).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

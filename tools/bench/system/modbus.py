@@ -1,7 +1,5 @@
 """The Modbus server against pymodbus's own server: both in one process, asked in turns by one plain-socket client."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import json

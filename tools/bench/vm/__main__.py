@@ -4,8 +4,6 @@ Ends with 0 if every scenario passed, 1 if one did not or was not run, 2 if this
 what is missing).
 """
 
-from __future__ import annotations
-
 import argparse
 import signal
 import sys

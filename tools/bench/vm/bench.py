@@ -1,7 +1,5 @@
 """What a scenario has at hand: the emulated computer, the world around it, and the daemon as others see it."""
 
-from __future__ import annotations
-
 import json
 import math
 import select

@@ -5,8 +5,6 @@ held, and its memory and what it has written to its disk are kept (QEMU's migrat
 each run: the reboot and the power cut. What is kept fits one QEMU and one command line only, which its name tells.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

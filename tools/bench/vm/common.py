@@ -1,7 +1,5 @@
 """What scenarios share: how they are told apart from other functions, and what several of them do and ask."""
 
-from __future__ import annotations
-
 import math
 import struct
 import time

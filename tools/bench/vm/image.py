@@ -5,8 +5,6 @@ base with the package of these sources and its kernels compiled for any processo
 others see: the file system is made from a folder.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The emulated computer: QEMU with the image's kernel and disk, its network, its two wires, and its reset button."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

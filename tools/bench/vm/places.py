@@ -1,7 +1,5 @@
 """Where the bench works and keeps things, and what a machine must have for it."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

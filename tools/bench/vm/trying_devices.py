@@ -1,7 +1,5 @@
 """Scenarios: the lidar goes and comes, on a real serial port."""
 
-from __future__ import annotations
-
 import time
 from typing import Final
 

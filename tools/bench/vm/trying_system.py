@@ -1,7 +1,5 @@
 """Scenarios: the system comes up with the service in it, and others see its pose."""
 
-from __future__ import annotations
-
 import json
 import re
 import statistics

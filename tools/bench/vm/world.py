@@ -6,8 +6,6 @@ a pause before each. The lamps over it are ordinary ones: looking for others' co
 enough.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import secrets

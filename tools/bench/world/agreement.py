@@ -6,8 +6,6 @@ which change slowly, at equal ways driven. When the first loop is closed the who
 for, which is centimetres, and with which keyframe it is closed depends on the scans: until then two runs say the same.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Where the configuration is found, what says so, and `lumiloop config`."""
 
-from __future__ import annotations
-
 import logging
 import tomllib
 from pathlib import Path

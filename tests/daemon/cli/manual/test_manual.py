@@ -1,7 +1,5 @@
 """Help on one screen, examples that run, suggestions, completion in a real shell, and man pages."""
 
-from __future__ import annotations
-
 import logging
 import os
 import pty

@@ -1,7 +1,5 @@
 """``lumiloop map info`` and ``map verify``: what they say, and that they load no compiler."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What all appended blocks share: refusals, reads of a part, the frozen contracts and the pages."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import dataclass
@@ -15,12 +13,9 @@ from daemon.publish.modbus import dimmed_block, integrity_block, lights_block, p
 from daemon.publish.modbus.points import Layout
 from daemon.publish.modbus.requests import BLOCKS, Responder
 from daemon.snapshot import LightFix, LinkUse, LoopReason, Part, Snapshot, Stage, Thread
-from tests.daemon.publish.modbus.test_light_blocks import DIMMED
-from tests.daemon.publish.modbus.test_state_blocks import TRUST
-from tests.daemon.publish.modbus.test_light_blocks import picture
-from tests.daemon.publish.modbus.test_state_blocks import CONDITION
+from tests.daemon.publish.modbus.test_light_blocks import DIMMED, picture
 from tests.daemon.publish.modbus.test_registers import snapshot
-from tests.daemon.publish.modbus.test_state_blocks import PULSE
+from tests.daemon.publish.modbus.test_state_blocks import CONDITION, PULSE, TRUST
 
 FROZEN = Path(__file__).parent / "frozen"
 

@@ -1,7 +1,5 @@
 """The blocks of lights and of PWM-dimmed lamps, and the end of the datagram: places, units, unknown values."""
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

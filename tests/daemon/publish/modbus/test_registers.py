@@ -1,7 +1,5 @@
 """The table: round trips, saturation, not-known values, frames, and the frozen contract."""
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

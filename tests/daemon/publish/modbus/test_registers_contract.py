@@ -1,7 +1,5 @@
 """The layout of registers and datagrams is the frozen one, or of a newer version."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

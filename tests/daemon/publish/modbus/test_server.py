@@ -1,7 +1,5 @@
 """The Modbus server: its start, its clients over UDP and TCP."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import os

@@ -1,7 +1,5 @@
 """The server among clients that misbehave: nobody is disturbed, nothing is torn, connections have limits."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import logging

@@ -1,7 +1,5 @@
 """The blocks of integrity, of parts and of the cycle: places, units, unknown values."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 

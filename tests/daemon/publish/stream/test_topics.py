@@ -1,7 +1,5 @@
 """Topics of the local stream: rates, contents and fields."""
 
-from __future__ import annotations
-
 import asyncio
 import zlib
 from dataclasses import fields, replace

@@ -1,7 +1,5 @@
 """The fake's chips, byte for byte by their data sheets."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The fake bus: time on the wire, adapters with their limits, and what each fault does there."""
 
-from __future__ import annotations
-
 import errno
 import itertools
 

@@ -1,7 +1,5 @@
 """A whole receiver in a process of its own, and the real driver on its bus: real sockets, real threads, real time."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

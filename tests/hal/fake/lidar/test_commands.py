@@ -1,7 +1,5 @@
 """What a sensor refuses, with which status, and how lines of the host are read."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 

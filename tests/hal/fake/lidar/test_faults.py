@@ -1,7 +1,5 @@
 """Faults of the fake lidar do on the wire what their words say: states, texts, bytes, values, times."""
 
-from __future__ import annotations
-
 import asyncio
 
 import numpy as np

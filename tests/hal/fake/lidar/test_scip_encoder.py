@@ -1,7 +1,5 @@
 """The encoder of the fake: against examples worked out by hand and against a real sensor's dialogue."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

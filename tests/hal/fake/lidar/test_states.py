@@ -1,7 +1,5 @@
 """States of the fake lidar, and the world that it scans."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Scans on the wire: ranges, counts, stamps and instants."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The virtual bench: its judgement of daemons and drives, and the package in an emulated computer."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

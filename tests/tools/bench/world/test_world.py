@@ -1,7 +1,5 @@
 """A played world: scenario files, the judge, and a robot computer that drives in it."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

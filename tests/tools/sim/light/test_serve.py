@@ -1,7 +1,5 @@
 """The lights of a simulated building, read by another process over a socket."""
 
-from __future__ import annotations
-
 import asyncio
 from contextlib import AsyncExitStack
 from pathlib import Path
