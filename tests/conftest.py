@@ -16,6 +16,7 @@ import pytest
 from hypothesis import settings
 
 from hal.clock import run_virtual
+from tests.commands import done, refused  # noqa: F401  # fixtures
 from tests.pace import Pace, judge
 
 settings.register_profile("the same examples", deadline=None, derandomize=True)
