@@ -48,7 +48,7 @@ from hal.replay import recording
 
 FROZEN: Final = Path(__file__).parents[2] / "tests" / "daemon" / "publish" / "modbus" / "frozen" / "release.json"
 NOW: Final = FROZEN.with_name("unreleased.json")
-ENUMS: Final = ("State", "LightFix", "LinkUse", "LoopReason", "Part", "Thread")
+ENUMS: Final = ("State", "LightFix", "LinkUse", "LoopReason", "Part", "Thread", "Stage")
 
 Items = dict[str, str]
 Contracts = dict[str, dict[str, Any]]
