@@ -158,12 +158,6 @@ def test_a_map_of_two_files(tmp_path: Path) -> None:
         load(tmp_path / "none.yaml")
 
 
-@given(st.text(alphabet="image:resolutnrgdc_ths-[],.0123456789#'\"\n \t%", max_size=300))
-def test_no_text_does_more_than_be_refused(text: str) -> None:
-    with contextlib.suppress(BadMapServer):
-        assert describe(HERE, text).resolution > 0.0
-
-
 @given(st.sampled_from((b"P5\n", b"P2\n", b"P5 4 4 255\n", b"P2 2 2 9\n")), st.binary(max_size=80))
 def test_no_bytes_do_more_than_be_refused(head: bytes, data: bytes) -> None:
     with contextlib.suppress(BadPicture):
