@@ -23,16 +23,18 @@ async def running(run: Coroutine[Any, Any, None]) -> AsyncGenerator[asyncio.Task
             await task
 
 
-def played(play: Callable[[Callable[[Any], Awaitable[None]]], None]) -> Callable[..., Callable[..., None]]:
-    """Make a test of a coroutine with the argument ``bench``: ``play`` runs it and passes the bench."""
+def played(
+    play: Callable[[Callable[[Any], Awaitable[None]]], object], name: str = "bench"
+) -> Callable[..., Callable[..., None]]:
+    """Make a test of a coroutine with an argument of that name, its bench: ``play`` runs it and passes the bench."""
 
     def made(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
         @functools.wraps(body)
         def test(*here: object, **given: object) -> None:
-            play(lambda bench: body(*here, bench, **given))
+            play(lambda bench: body(*here, **{name: bench}, **given))
 
         arguments = inspect.signature(body).parameters.values()
-        test.__signature__ = inspect.Signature([one for one in arguments if one.name != "bench"])  # type: ignore[attr-defined]  # what pytest reads
+        test.__signature__ = inspect.Signature([one for one in arguments if one.name != name])  # type: ignore[attr-defined]  # what pytest reads
         return test
 
     return made

@@ -8,7 +8,7 @@ import pytest
 from hal.fake.faults.orders import FaultError
 from hal.fake.lidar.faults import LIDAR
 from hal.fake.lidar.models import UTM_30LX
-from tests.hal.fake.bench import Talk, read, summed, virtual
+from tests.hal.fake.bench import Talk, read, summed, talking, virtual
 
 
 def text(toml: str, command: str) -> bytes:
@@ -39,23 +39,19 @@ def test_dmax() -> None:
     assert read(text(order("dmax"), "PP")).pairs["DMAX"] == "262143"
 
 
-def test_modem_manager() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        talk.schedule.load(order("inject", when=0.1))
-        await talk.ask(MD, 0.5)
-        return [reply.echo + reply.status for reply in talk.replies()]
-
-    replies = virtual(scene)
+@talking()
+async def test_modem_manager(talk: Talk) -> None:
+    talk.schedule.load(order("inject", when=0.1))
+    await talk.ask(MD, 0.5)
+    replies = [reply.echo + reply.status for reply in talk.replies()]
     assert replies.count("AT0E") == 1
     assert replies.count(MD + "99") == 19
 
 
-def test_baud_is_refused_where_there_is_no_line_rate() -> None:
-    async def scene(talk: Talk) -> None:
-        with pytest.raises(FaultError, match="no line rate"):
-            talk.schedule.load(order("baud"))
-
-    virtual(scene)
+@talking()
+async def test_baud_is_refused_where_there_is_no_line_rate(talk: Talk) -> None:
+    with pytest.raises(FaultError, match="no line rate"):
+        talk.schedule.load(order("baud"))
 
 
 @pytest.mark.parametrize("what", sorted(LIDAR))
@@ -141,14 +137,12 @@ def test_pieces(clean: list[bytes], size: int) -> None:
     assert whole == b"".join(clean)[: len(whole)]
 
 
-def test_the_last_line_feed_apart() -> None:
-    async def scene(talk: Talk) -> list[tuple[float, bytes]]:
-        talk.schedule.load(order("chunks", piece=0, split_end=True))
-        talk.say(MD + "\n")
-        await asyncio.sleep(0.2)
-        return talk.pieces
-
-    got = virtual(scene)
+@talking()
+async def test_the_last_line_feed_apart(talk: Talk) -> None:
+    talk.schedule.load(order("chunks", piece=0, split_end=True))
+    talk.say(MD + "\n")
+    await asyncio.sleep(0.2)
+    got = talk.pieces
     assert {data for _, data in got[1::2]} == {b"\n"}
     assert all(data.endswith(b"\n") and b"\n\n" not in data for _, data in got[::2])
     assert all(b[0] > a[0] for a, b in zip(got[::2], got[1::2], strict=False))
