@@ -56,37 +56,33 @@ def test_a_clock_that_steps_back_holds_nobody_for_ever() -> None:
     assert share.begin()
 
 
-def test_a_flood_waits_for_the_next_slice_and_is_served_then() -> None:
+async def test_a_flood_waits_for_the_next_slice_and_is_served_then() -> None:
     served = 0
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ours.setblocking(False)
+    watch = Watch()
+    share = Share(watch)
 
-    async def run() -> tuple[int, int]:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        ours.setblocking(False)
-        watch = Watch()
-        share = Share(watch)
+    def serve() -> None:
+        nonlocal served
+        served += len(ours.recv(1))
+        watch.t += 0.6 * PART * SLICE_S
 
-        def serve() -> None:
-            nonlocal served
-            served += len(ours.recv(1))
-            watch.t += 0.6 * PART * SLICE_S
-
-        reader = Reader(ours.fileno(), serve, share)
-        for _ in range(6):
-            theirs.send(b"x")
-        await asyncio.sleep(0.005)
-        first = served
-        for _ in range(200):
-            watch.t += 0.1 * SLICE_S
-            await asyncio.sleep(0.001)
-        reader.close()
-        reader.close()
-        theirs.send(b"y")
-        await asyncio.sleep(0.02)
-        ours.close()
-        theirs.close()
-        return first, served
-
-    assert asyncio.run(run()) == (2, 6)
+    reader = Reader(ours.fileno(), serve, share)
+    for _ in range(6):
+        theirs.send(b"x")
+    await asyncio.sleep(0.005)
+    first = served
+    for _ in range(200):
+        watch.t += 0.1 * SLICE_S
+        await asyncio.sleep(0.001)
+    reader.close()
+    reader.close()
+    theirs.send(b"y")
+    await asyncio.sleep(0.02)
+    ours.close()
+    theirs.close()
+    assert (first, served) == (2, 6)
 
 
 async def test_closing_while_waiting_ends_it() -> None:
