@@ -2,6 +2,8 @@
 
 import asyncio
 import errno
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
 from itertools import pairwise
 
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from hal.bus import i2c_frames as frames
 from hal.bus.i2c import AsyncBus, Message, Transferred, check, read, write
 from hal.bus.opening import blocking_opener, open_bus
-from hal.clock import LoopClock, run_virtual
+from hal.clock import LoopClock
 from hal.errors import DeviceFault, DeviceMissing, DeviceRefused, HalError
 from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.faults.schedule import FaultSchedule
@@ -52,24 +54,23 @@ def test_the_longest_that_goes() -> None:
     check(tuple(read(0x7F, 8192) for _ in range(42)))
 
 
-def on_memory(body: object, fault: str = "") -> None:
-    async def main() -> None:
-        clock = LoopClock(asyncio.get_running_loop())
-        fake = FakeAdc(lambda t: 0.0 * t + 0.5, clock)
-        buses = FakeBuses(clock)
-        buses.plug("x", fake)
-        schedule = FaultSchedule({"adc": fake})
-        if fault:
-            schedule.load(f"[[fault]]\n{fault}")
-            await asyncio.sleep(1e-6)
-        await body(await buses("x"), fake)  # type: ignore[operator]  # an async function of the test
-        schedule.close()
-
-    run_virtual(main(), start=50.0)
+@asynccontextmanager
+async def on_memory(fault: str = "") -> AsyncGenerator[tuple[AsyncBus, FakeAdc]]:
+    clock = LoopClock(asyncio.get_running_loop())
+    fake = FakeAdc(lambda t: 0.0 * t + 0.5, clock)
+    buses = FakeBuses(clock)
+    buses.plug("x", fake)
+    schedule = FaultSchedule({"adc": fake})
+    if fault:
+        schedule.load(f"[[fault]]\n{fault}")
+        await asyncio.sleep(1e-6)
+    yield await buses("x"), fake
+    schedule.close()
 
 
-def test_a_memory_bus_takes_the_time_of_its_bits() -> None:
-    async def body(bus: AsyncBus, fake: FakeAdc) -> None:
+@pytest.mark.virtual
+async def test_a_memory_bus_takes_the_time_of_its_bits() -> None:
+    async with on_memory() as (bus, _):
         loop = asyncio.get_running_loop()
         before = loop.time()
         done = await bus.transfer((read(0x4D, 1000),))
@@ -78,21 +79,19 @@ def test_a_memory_bus_takes_the_time_of_its_bits() -> None:
         assert loop.time() == pytest.approx(done.t1)
         assert done.t1 - done.t0 == pytest.approx(9010 / 400e3, abs=1e-4)
 
-    on_memory(body)
 
-
-def test_a_failure_takes_its_time_too() -> None:
-    async def body(bus: AsyncBus, fake: FakeAdc) -> None:
+@pytest.mark.virtual
+async def test_a_failure_takes_its_time_too() -> None:
+    async with on_memory("what = 'timeout'") as (bus, _):
         before = asyncio.get_running_loop().time()
         with pytest.raises(TimeoutError):
             await bus.transfer((read(0x4D, 1000),))
         assert asyncio.get_running_loop().time() - before == pytest.approx(1.0, abs=1e-3)
 
-    on_memory(body, "what = 'timeout'")
 
-
-def test_transactions_take_turns_with_a_stream() -> None:
-    async def body(bus: AsyncBus, fake: FakeAdc) -> None:
+@pytest.mark.virtual
+async def test_transactions_take_turns_with_a_stream() -> None:
+    async with on_memory() as (bus, _):
         got: list[Transferred] = []
         task = asyncio.create_task(bus.stream((read(0x4D, 2222),), lambda done, dropped: got.append(done)))
         await asyncio.sleep(0.12)
@@ -103,11 +102,10 @@ def test_transactions_take_turns_with_a_stream() -> None:
         assert len(got) >= 5
         assert any(early.t1 <= between.t0 < between.t1 <= late.t0 for early, late in pairwise(got))
 
-    on_memory(body)
 
-
-def test_an_unplugged_adapter_stays_dead_for_whoever_had_it_open() -> None:
-    async def body(bus: AsyncBus, fake: FakeAdc) -> None:
+@pytest.mark.virtual
+async def test_an_unplugged_adapter_stays_dead_for_whoever_had_it_open() -> None:
+    async with on_memory() as (bus, fake):
         schedule = FaultSchedule({"adc": fake})
         schedule.load("[[fault]]\nwhat = 'gone'\nfor = 1.0")
         await asyncio.sleep(0.5)
@@ -116,8 +114,6 @@ def test_an_unplugged_adapter_stays_dead_for_whoever_had_it_open() -> None:
                 await bus.transfer((read(0x4D, 2),))
             await asyncio.sleep(1.0)
         schedule.close()
-
-    on_memory(body)
 
 
 @pytest.mark.virtual

@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import errno
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,6 @@ from hal.fake.faults.schedule import FaultSchedule
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import UST_10LX
-from hal.fake.transport.pty_server import PtyServer
 from hal.fake.transport.tcp_server import TcpServer
 from tests.hal.fake.bench import ramp, read
 from tests.hal.fake.real_time import PATIENCE, gather, on_pty, opened, until
@@ -25,8 +25,8 @@ MD = b"MD0000108000000\n"
 pytestmark = pytest.mark.realtime
 
 
-def test_pty_streams_what_the_world_says(tmp_path: Path) -> None:
-    async def scene(device: FakeHokuyo, server: PtyServer) -> None:
+async def test_pty_streams_what_the_world_says(tmp_path: Path) -> None:
+    async with on_pty(tmp_path / "lidar") as (device, server):
         with opened(server.path) as port:
             port.write(b"VV\n" + MD)
             vv, ack, *scans = await gather(port, 22)
@@ -44,11 +44,9 @@ def test_pty_streams_what_the_world_says(tmp_path: Path) -> None:
             port.write(b"QT\n")
             await until(lambda: device.state is State.IDLE)
 
-    on_pty(scene, tmp_path / "lidar")
 
-
-def test_pty_goes_on_when_the_host_leaves_and_nothing_stale_is_left(tmp_path: Path) -> None:
-    async def scene(device: FakeHokuyo, server: PtyServer) -> None:
+async def test_pty_goes_on_when_the_host_leaves_and_nothing_stale_is_left(tmp_path: Path) -> None:
+    async with on_pty(tmp_path / "lidar") as (device, server):
         with opened(server.path) as port:
             port.write(MD)
             await gather(port, 3)
@@ -59,13 +57,10 @@ def test_pty_goes_on_when_the_host_leaves_and_nothing_stale_is_left(tmp_path: Pa
             _, scan, *_ = await gather(port, 3)  # the first may be the rest of one
             assert read(scan).values()[0] >= 1000 + 2 * (before - 1)
 
-    on_pty(scene, tmp_path / "lidar")
 
-
-def test_pty_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
+async def test_pty_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
     link = tmp_path / "lidar"
-
-    async def scene(device: FakeHokuyo, server: PtyServer) -> None:
+    async with on_pty(link) as (device, server):
         schedule = FaultSchedule({"lidar": device})
         port = opened(server.path)
         port.write(MD)
@@ -87,24 +82,17 @@ def test_pty_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
             await gather(again, 3)
         schedule.close()
 
-    on_pty(scene, link)
 
-
-Scene = Callable[[FakeHokuyo, TcpServer, int], Awaitable[None]]
-
-
-def on_tcp(scene: Scene) -> None:
-    async def main() -> None:
-        device = FakeHokuyo(UST_10LX, ramp(UST_10LX))
-        server = TcpServer(device)
-        port = await server.listen()
-        try:
-            await scene(device, server, port)
-        finally:
-            await server.close()
-            device.close()
-
-    asyncio.run(main())
+@asynccontextmanager
+async def on_tcp() -> AsyncIterator[tuple[FakeHokuyo, TcpServer, int]]:
+    device = FakeHokuyo(UST_10LX, ramp(UST_10LX))
+    server = TcpServer(device)
+    port = await server.listen()
+    try:
+        yield device, server, port
+    finally:
+        await server.close()
+        device.close()
 
 
 class Client:
@@ -135,8 +123,8 @@ class Client:
         return True
 
 
-def test_tcp_one_host_at_a_time_and_a_closed_connection_stops_the_sensor() -> None:
-    async def scene(device: FakeHokuyo, server: TcpServer, port: int) -> None:
+async def test_tcp_one_host_at_a_time_and_a_closed_connection_stops_the_sensor() -> None:
+    async with on_tcp() as (device, server, port):
         async with Client(port) as first:
             first.writer.write(MD)
             for _ in range(10):
@@ -151,11 +139,9 @@ def test_tcp_one_host_at_a_time_and_a_closed_connection_stops_the_sensor() -> No
             third.writer.write(b"BM\n")
             assert await third.reply() == b"BM\n00P\n\n"
 
-    on_tcp(scene)
 
-
-def test_tcp_drops_at_reboot_and_comes_back() -> None:
-    async def scene(device: FakeHokuyo, _server: TcpServer, port: int) -> None:
+async def test_tcp_drops_at_reboot_and_comes_back() -> None:
+    async with on_tcp() as (device, _, port):
         async with Client(port) as host:
             host.writer.write(b"RB\nRB\n")
             assert await host.end()
@@ -166,5 +152,3 @@ def test_tcp_drops_at_reboot_and_comes_back() -> None:
         async with Client(port) as host:
             host.writer.write(b"QT\n")
             assert await host.reply() == b"QT\n00P\n\n"
-
-    on_tcp(scene)
