@@ -1,7 +1,5 @@
 """Options shared by all tests: which device end to use, and where real logs are."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib
@@ -18,6 +16,7 @@ import pytest
 from hypothesis import settings
 
 from hal.clock import run_virtual
+from tests.commands import done, refused  # noqa: F401  # fixtures
 from tests.pace import Pace, judge
 
 settings.register_profile("the same examples", deadline=None, derandomize=True)
@@ -33,7 +32,7 @@ as long, and reach hardly one that the other tests do not (see `tools.ci.floors`
 row without the compiler."""
 
 FIRST = (
-    "tools/test_soak.py",
+    "tools/test_programs.py",
     "faults/test_matrix.py",
     "systemd/test_container.py",
     "tools/experiments/integrity/test_campaign.py",

@@ -4,8 +4,6 @@ The number of runnable threads of the whole computer is sampled while such a tes
 looked at: it counts as skipped, with the measured reason, if its threads had less than a third of the processors.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which share of a large set of tests runs with this commit; all of them run with the slow ones (``make test-all``)."""
 
-from __future__ import annotations
-
 import subprocess
 from functools import cache
 from pathlib import Path

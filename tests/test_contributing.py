@@ -1,7 +1,5 @@
 """CONTRIBUTING.md names what exists; the hooks are `make check`; `make bless` wants a reason; locks fit the groups."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The documents: every relative link leads somewhere, every command and make target named exists."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The pages for users: their number of words, and the length of their sentences."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

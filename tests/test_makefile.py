@@ -1,7 +1,5 @@
 """What the Makefile promises of all its targets."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

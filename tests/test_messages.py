@@ -4,8 +4,6 @@ A message is a string of three words or more that is no docstring: of a log line
 text, a line of a report, a text of the web page.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

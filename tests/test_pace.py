@@ -1,7 +1,5 @@
 """A failed test of real time is skipped on a crowded machine, with the measure, and nowhere else."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

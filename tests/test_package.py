@@ -1,7 +1,5 @@
 """What is shipped: every file of ours is in the wheel, and every room in what is installed."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from fnmatch import fnmatch

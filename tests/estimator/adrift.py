@@ -1,7 +1,5 @@
 """A robot with a stored map that does not know where in it it is: buildings, ways through them, and its cycles."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Ceilings, blocks and decoder runs for the tests of the light decoder."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """A drive round and round in the paper's room with odometry that drifts, straight into keyframes and loops."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

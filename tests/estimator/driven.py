@@ -1,7 +1,5 @@
 """Drives of the simulated robot through the simulated buildings, for the estimator alone: no bytes, no daemon."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

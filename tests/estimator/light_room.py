@@ -1,7 +1,5 @@
 """A small lit room for tests of the `lights` filter: strengths by the filter's own model, with chosen departures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field

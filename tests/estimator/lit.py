@@ -1,7 +1,5 @@
 """A lit drive for the tests of the whole step: odometry and light of a link-level run, scans of the simulated lidar."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from heapq import merge

@@ -1,7 +1,5 @@
 """A kernel that looks at one element, wherever it is told to: for the test of the index check."""
 
-from __future__ import annotations
-
 from estimator.measurements import Array
 from estimator.numerics.jit import kernel
 

@@ -4,8 +4,6 @@ The photocurrent may be limited, as by a first stage that saturates; single lamp
 ambient light and receiver of a :class:`tools.sim.light.waveform.Ceiling`, and yields blocks like it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

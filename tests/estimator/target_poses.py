@@ -3,8 +3,6 @@
 Run in child processes by `test_jit_targets`, once for each way of compiling the kernels.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A teach drive by the estimator's own forward model, with errors that stay where they are on the floor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bad scans through the whole step, by each method: a reason, no exception, no wrong pose, and it goes on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What a step leaves out on each level, and that it takes everything up again afterwards."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the estimator exports: the same names for the interpreter and the type checker, and all that other rooms use."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

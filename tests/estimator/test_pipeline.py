@@ -1,7 +1,5 @@
 """A robot in a box room: the step follows it, keeps its word about bad input, and draws the room."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from functools import cache
 

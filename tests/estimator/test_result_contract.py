@@ -1,7 +1,5 @@
 """What a result promises beyond its pose: its frame, that it stays as it was, an uncertainty that is not too small."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scans in plain rooms, for the estimator's tests: the truth is known, the noise is Gaussian, nothing else happens."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from estimator.mapping.keyframe import keep

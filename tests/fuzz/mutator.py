@@ -3,8 +3,6 @@
 Damage is done to well-formed inputs and to the corpus: inputs that a search by coverage found (`tests/fuzz/corpus`).
 """
 
-from __future__ import annotations
-
 import gc
 import random
 import time

@@ -1,7 +1,5 @@
 """Words, registers, frames and whole storms of faults at random: nothing may break, and nothing untrue may come out."""
 
-from __future__ import annotations
-
 import asyncio
 import random
 

@@ -1,7 +1,5 @@
 """The light decoder under words, sizes, rates and times at random: it never raises, and claims no lamp that is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings

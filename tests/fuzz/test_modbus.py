@@ -1,7 +1,5 @@
 """Bytes that nobody should send: never an exception, always a well-formed answer or none."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 
@@ -66,14 +64,6 @@ def test_every_frame_gets_a_well_formed_answer(frame: bytes, write: bool) -> Non
     answer = made.answer(frame)
     check_answer(frame, answer)
     assert made.answer(framed(1, 1, b"\x04\0\0\0\x40"))[9:] == registers.encode_block(snapshot()), "nothing was written"
-
-
-@given(st.binary(max_size=300))
-def test_raw_bytes_are_judged_before_they_are_answered(data: bytes) -> None:
-    size = frame_size(data)
-    assert -1 <= size <= MAX_FRAME
-    if data and size == len(data):
-        check_answer(data, responder().answer(data))
 
 
 def whole_frames(stream: bytes) -> tuple[int, bool]:

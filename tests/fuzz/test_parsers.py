@@ -3,8 +3,6 @@
 ``make fuzz`` runs this file with a tenth of the full size, ``make fuzz ARGS="-m slow"`` with all of it.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from typing import Any

@@ -5,8 +5,6 @@ damaged frame with other values, that frame must be a well-formed SCIP frame, ev
 asserted too, and that no single damaged character can be among them.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from random import Random

@@ -1,7 +1,5 @@
 """Damage at every door of the real processes at once; ``make fuzz-together`` does it for a minute."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -7,8 +7,6 @@ the logs hold, growth of each process's memory after a third of the time, and an
 where there is a traceback, a process has ended, or one has grown by more than :data:`GROWN_MB`.
 """
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import importlib

@@ -1,7 +1,5 @@
 """Calls that block: what becomes of them, and that a stop does not wait for them."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import threading

@@ -1,7 +1,5 @@
 """Drivers by name: lazily imported, extended by entry points, wrong names answered with the right ones."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from importlib.metadata import EntryPoint

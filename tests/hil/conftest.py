@@ -1,7 +1,5 @@
 """Options to ends, needs to skips, coroutines to runs, and what was seen to a report."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import time

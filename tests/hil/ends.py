@@ -3,8 +3,6 @@
 A body is a coroutine; :meth:`End.play` runs it where its device is.
 """
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import math

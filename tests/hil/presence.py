@@ -1,7 +1,5 @@
 """Whether a device is there at all: looked at before the first test of it, so that what is missing is said once."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import dataclass, field
 

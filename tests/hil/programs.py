@@ -1,14 +1,11 @@
 """Programs of their own: the shipped one, and the fakes where they have to be other processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import select
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,6 +20,7 @@ import pytest
 from tests.hil.ends import Operator, SocketOperator
 from tools.bench.support.children import LEASH
 from tools.clients.read_modbus import Reader
+from tools.sim.ports import free_port
 
 ROOT: Final = Path(__file__).parents[2]
 START_S: Final = 60.0
@@ -163,13 +161,6 @@ def daemon(words: list[str], served: Served, *more: str) -> Generator[Daemon]:
         finally:
             if child.poll() is None:
                 child.kill()
-
-
-def free_port() -> int:
-    """A port that nobody has, for UDP and TCP."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def probed(words: list[str], *devices: str) -> list[dict[str, Any]]:

@@ -1,7 +1,5 @@
 """The device suite on fakes in other processes, and where a device is missing."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -11,7 +9,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from tests.hil.programs import ROOT, free_port, served_lidar, served_receiver
+from tests.hil.programs import ROOT, served_lidar, served_receiver
+from tools.sim.ports import free_port
 
 ON_DEVICES = 8
 """Tests of the lidar that need no minutes, and the probe."""

@@ -1,7 +1,5 @@
 """A lidar that stands still: who it is, what it sees, how fast, when, how exactly."""
 
-from __future__ import annotations
-
 import asyncio
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A photodiode's converter: which it is, how fast it is read, what it says in the light and in the dark."""
 
-from __future__ import annotations
-
 import asyncio
 from itertools import pairwise
 

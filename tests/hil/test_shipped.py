@@ -1,7 +1,5 @@
 """The shipped program on the device: it finds it, runs on it, survives its cable, and learns from a walk with it."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import time

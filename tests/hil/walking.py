@@ -1,7 +1,5 @@
 """A walk: somebody drives the robot about while the shipped program records; a simulated robot where there is none."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
@@ -14,7 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.hil.ends import Operator
-from tests.hil.programs import Served, daemon, free_port, process
+from tests.hil.programs import Served, daemon, process
+from tools.sim.ports import free_port
 from tools.sim.robot.drive import Body
 
 SIMULATED_S: Final = 30.0

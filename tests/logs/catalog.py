@@ -1,7 +1,5 @@
 """The logs whose replay is watched, committed ones of the simulator and real ones, and how replay gets to read each."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Replays of real logs, each run once however many tests look at it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Which logs are watched. Imports nothing of the estimator: a command tells its names before that is compiled."""
 
-from __future__ import annotations
-
 import argparse
 import os
 from dataclasses import dataclass

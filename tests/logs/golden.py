@@ -8,8 +8,6 @@ the blessing. On another machine the tight one counts against a reference of its
 (``bless --here``); it is not committed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Sequence

@@ -4,8 +4,6 @@
 recording stays as it is when the simulator changes, so that a pose that moves has been moved by the daemon.
 """
 
-from __future__ import annotations
-
 import asyncio
 import io
 import lzma

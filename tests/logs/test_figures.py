@@ -3,8 +3,6 @@
 In one file, which one process runs: each log is replayed once for all that looks at it.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Golden trajectories: their contents, the report of a difference, references of other machines."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -5,8 +5,6 @@ it. Nothing is left behind: the container is stopped, its files are removed, and
 its name spaces. What a killed session could not remove, the next one does.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -3,8 +3,6 @@
 Everything else that it is asked for, the scripts of the installation above all, the real interpreter does.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

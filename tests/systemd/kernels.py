@@ -4,8 +4,6 @@ Compiling all of them takes a minute or two of a processor; those of this tree s
 sources. Some are left out, to be compiled there.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from daemon.runtime.warmup import LIGHT, OFFLINE

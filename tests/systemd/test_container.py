@@ -1,7 +1,5 @@
 """The package on a fresh Debian under its real service manager: start, READY, devices, watchdog, kill, stop."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

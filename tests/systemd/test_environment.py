@@ -1,7 +1,5 @@
 """An upgrade is built beside the version in use: whatever happens to it, the version of before runs on."""
 
-from __future__ import annotations
-
 import fcntl
 import mmap
 import os

@@ -1,7 +1,5 @@
 """The unit files as they are shipped: valid, hardened, and free of what would break the compiler."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -28,6 +26,12 @@ TAPS = {
 """Units of what listens to the daemon, and the commands that they start."""
 
 needs_analyze = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+
+
+def installed(order: str, dest: Path, prefix: str = "/opt/lumiloop", **more: str) -> subprocess.CompletedProcess[str]:
+    """Carry out an order of the installer below a folder."""
+    environment = {**os.environ, "DESTDIR": str(dest), "PREFIX": prefix, **more}
+    return subprocess.run([SYSTEMD / "install.sh", order], env=environment, capture_output=True, text=True)
 
 
 def settings(path: Path) -> list[tuple[str, str]]:
@@ -225,8 +229,7 @@ def test_every_unit_is_installed_and_removed(tmp_path: Path) -> None:
         unit = tmp_path / "usr/lib/systemd/system" / name
         unit.parent.mkdir(parents=True, exist_ok=True)
         unit.touch()
-    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
-    subprocess.run([SYSTEMD / "install.sh", "uninstall"], env=environment, check=True, capture_output=True)
+    installed("uninstall", tmp_path).check_returncode()
     assert not list(unit.parent.iterdir())
     (stopped,) = re.findall(r"disable --now (.*) \|\|", (SYSTEMD / "package.sh").read_text())
     assert sorted(stopped.replace("TAPS", taps).split()) == UNITS
@@ -240,9 +243,8 @@ def test_links_of_the_installed_pages_lead_somewhere(tmp_path: Path) -> None:
         copy = code / path.relative_to(SYSTEMD.parent / "estimator")
         copy.parent.mkdir(exist_ok=True)
         copy.touch()
-    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
     for _ in range(2):  # an installation over an older one
-        subprocess.run([SYSTEMD / "install.sh", "files"], env=environment, check=True, capture_output=True)
+        installed("files", tmp_path).check_returncode()
     assert len(list((tmp_path / pages.DOCUMENTS).rglob("*.md"))) > 40
     assert pages.dead_links(tmp_path) == []
     assert (tmp_path / pages.DOCUMENTS / "LICENSE").read_text() == (SYSTEMD.parent / "LICENSE").read_text()
@@ -262,12 +264,9 @@ def test_a_purge_leaves_nothing_that_a_unit_has_written(tmp_path: Path) -> None:
     for place in places:
         (tmp_path / place).mkdir(parents=True)
         (tmp_path / place.replace("/private", "")).symlink_to(f"private/{Path(place).name}")
-    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
-    subprocess.run([SYSTEMD / "install.sh", "uninstall"], env=environment, check=True, capture_output=True)
+    installed("uninstall", tmp_path).check_returncode()
     assert all((tmp_path / place).is_dir() for place in places)
-    subprocess.run(
-        [SYSTEMD / "install.sh", "uninstall"], env=environment | {"PURGE": "1"}, check=True, capture_output=True
-    )
+    installed("uninstall", tmp_path, PURGE="1").check_returncode()
     assert [path for path in tmp_path.rglob("*lumiloop*") if "doc" not in path.parts] == []
     package = (SYSTEMD / "package.sh").read_text()
     for place in places:
@@ -307,8 +306,7 @@ def test_a_prefix_that_holds_other_things_is_left_alone(order: str, tmp_path: Pa
     other = tmp_path / "usr/local/bin/other"
     other.parent.mkdir(parents=True)
     other.touch()
-    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/usr/local", "PYTHON": sys.executable}
-    done = subprocess.run([SYSTEMD / "install.sh", order], env=environment, capture_output=True, text=True)
+    done = installed(order, tmp_path, "/usr/local", PYTHON=sys.executable)
     assert done.returncode == 1
     assert "must name a directory of its own" in done.stderr
     assert other.exists()
@@ -318,6 +316,5 @@ def test_what_an_interrupted_installation_has_left_is_removed(tmp_path: Path) ->
     made = tmp_path / "opt/lumiloop"
     made.mkdir(parents=True)
     (made / ".lumiloop").touch()
-    environment = {**os.environ, "DESTDIR": str(tmp_path), "PREFIX": "/opt/lumiloop"}
-    subprocess.run([SYSTEMD / "install.sh", "uninstall"], env=environment, check=True, capture_output=True)
+    installed("uninstall", tmp_path).check_returncode()
     assert not made.exists()

@@ -1,7 +1,5 @@
 """A short recorded drive, made once for all tests of the taps."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

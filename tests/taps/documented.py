@@ -1,7 +1,5 @@
 """Every command that stands in a block of code of the documents, and how it is known to do what is said of it."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path
@@ -31,7 +29,7 @@ RUN: Final = {
         r"map-files.md: lumiloop map", r"replay.md: lumiloop replay intel",
     ),
     "alone": (
-        r"air-interface.md: lumiloop codes", r"simulator.md: python -m tools.sim.(report|building.draw|light.draw)",
+        r"air-interface.md: lumiloop codes", r"simulator.md: python -m tools.sim.report",
         r"bench.md: python -m tools.bench.world --list",
     ),
 }  # fmt: skip
@@ -43,7 +41,7 @@ ELSEWHERE: Final = {
     r"formats.md: lumiloop export torn": "tests/taps/test_docs.py::test_the_exports_of_the_documents",
     r"installation.md: lumiloop doctor": "tests/taps/test_docs.py::test_the_doctor_of_the_documents",
     r".*: lumiloop probe": "tests/daemon/cli/test_probe.py",
-    r"calibration.md: lumiloop (survey|calibrate)": "tests/daemon/commissioning/test_teach_drive.py",
+    r"calibration.md: lumiloop (survey|calibrate)": "tests/daemon/commissioning/test_reach.py",
     r".*: make install": "tests/systemd/test_container.py",
     r"README.md: make demo|(start-demo|simulator).md: lumiloop demo|simulator.md: python -m tools.demo": (
         "tests/tools/demo/test_run.py"
@@ -55,7 +53,7 @@ ELSEWHERE: Final = {
     r"data.md: python -m tests.logs": "tests/logs",
     r"README.md: make docs": "tests/tools/docs/test_site.py",
     r"replay.md: lumiloop dump": (
-        "tests/daemon/replay/test_recorded_process.py::test_a_dump_is_asked_for_as_the_page_says"
+        "tests/daemon/replay/test_recorded_map.py::test_a_dump_is_asked_for_as_the_page_says"
     ),
     r"control.md: lumiloop": "tests/daemon/cli/orders/test_give.py",
     r"map-files.md: lumiloop switch-map": "tests/daemon/cli/orders/test_give.py",

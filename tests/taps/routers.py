@@ -1,9 +1,6 @@
 """A Zenoh router for tests, which can be ended and begun again."""
 
-from __future__ import annotations
-
 import asyncio
-import socket
 import time
 from argparse import Namespace
 from collections.abc import Callable, Coroutine, Iterator
@@ -15,12 +12,7 @@ import zenoh
 
 from daemon.config.schema import Config
 from taps.zenoh_session import session_config
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
+from tools.sim.ports import free_port
 
 
 class Router:

@@ -1,7 +1,5 @@
 """A stream with a robot on it, served from a thread as a daemon's process would."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 import zlib

@@ -1,7 +1,5 @@
 """Commands in the documents of the taps are commands: each is understood, and those that need no daemon are run."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import shlex

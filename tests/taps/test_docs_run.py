@@ -4,8 +4,6 @@ Only places are other ones (a folder of the test's own, this computer in place o
 times are shorter. What is run elsewhere, or cannot be run, is said in `tests.taps.documented`, with the reason.
 """
 
-from __future__ import annotations
-
 import gzip
 import itertools
 import os
@@ -25,7 +23,7 @@ from urllib.request import urlopen
 import pytest
 
 from tests.taps.documented import ELSEWHERE, NOT_RUN, ROOT, RUN, all_documented, to_run
-from tests.taps.routers import free_port
+from tools.sim.ports import free_port
 
 AT = "%H:%M:%S"
 SHORTER = {"--seconds": "2", "--journal-at": "2"}

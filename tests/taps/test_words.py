@@ -1,7 +1,5 @@
 """Commands of the taps: what is missing is named, with what to do."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 

@@ -1,7 +1,5 @@
 """The relations metric against the definition of its paper."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The lamp's program in C: its bits against the code tables, and its light against the decoder."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from dataclasses import dataclass, replace

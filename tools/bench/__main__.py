@@ -4,8 +4,6 @@ A benchmark is a module of this package with ``run() -> list[Figure]``. Times ar
 because this kind of machine is shared and noisy; a missed target is printed, never turned into a failed test.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import pkgutil

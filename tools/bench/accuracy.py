@@ -3,8 +3,6 @@
 ``LUMILOOP_BENCH=full`` runs 1000 trials a case (about a quarter of an hour), else 100 to 200.
 """
 
-from __future__ import annotations
-
 import os
 from typing import Final
 

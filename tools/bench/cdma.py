@@ -3,8 +3,6 @@
 ``python -m tools.bench.cdma --epochs 100000`` counts false IDs over that many blocks (a quarter of an hour).
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections import Counter

@@ -12,8 +12,6 @@ one of each log counts), from the wheels' motion where there are wheels, else fr
 beam at its own instant.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ machine is shared: beside wall time stands the processor time of the thread, whi
 and how many cycles were interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import gc

@@ -5,8 +5,6 @@
 each distance and ratio.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The `lights` filter: time of one update with 16 links in use, kernels alone and the whole call."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Iterator

@@ -14,8 +14,6 @@ thickness is the width across that holds the middle 90 % of them. What was moved
 **As published** are poses of which a place was claimed; guesses (LOST, RELOCATING, AMBIGUOUS) are counted.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 import subprocess

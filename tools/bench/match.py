@@ -4,8 +4,6 @@ Everything counts: normals and index of the reference, tangents of the new scan,
 work (the process is held to one, and its own processor time is taken), so that a busy machine says the same.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 import time

@@ -5,8 +5,6 @@ many random ones added. Needs ``LUMILOOP_DATA``; GTSAM is an optional peer (``pi
 time of the thread that works, for ours and for the peer, which uses one thread here as well.
 """
 
-from __future__ import annotations
-
 import gzip
 import os
 import tempfile

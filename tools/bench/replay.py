@@ -3,8 +3,6 @@
 Needs ``LUMILOOP_DATA``. Speed is of one process on one core, reading and results left out; the peer is real time.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 import tempfile

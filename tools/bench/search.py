@@ -4,8 +4,6 @@ Every pass is over scans of its own, many in turn: a processor that has seen the
 and such a time is half of what a robot gets. Of several times for the same pass the least counts.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable

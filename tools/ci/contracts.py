@@ -9,8 +9,6 @@ A contract breaks only under a new version number of its own. What is new since 
 unnoticed: it is written down beside it. Only tables are read here, nothing runs.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json
@@ -50,7 +48,7 @@ from hal.replay import recording
 
 FROZEN: Final = Path(__file__).parents[2] / "tests" / "daemon" / "publish" / "modbus" / "frozen" / "release.json"
 NOW: Final = FROZEN.with_name("unreleased.json")
-ENUMS: Final = ("State", "LightFix", "LinkUse", "LoopReason", "Part", "Thread")
+ENUMS: Final = ("State", "LightFix", "LinkUse", "LoopReason", "Part", "Thread", "Stage")
 
 Items = dict[str, str]
 Contracts = dict[str, dict[str, Any]]

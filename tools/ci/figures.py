@@ -4,8 +4,6 @@ A figure says what was measured, in which unit, against which target, and with w
 name the peer and its version.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Rooms where every byte comes from outside (codecs, registers, configuration) hav
 kernels are invisible to coverage, so they are run once more with the JIT switched off on small inputs.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -4,8 +4,6 @@ Changed files differ from the merge base with main; uncommitted and untracked on
 has changed itself, is named after a changed file, or imports a changed module directly.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import os

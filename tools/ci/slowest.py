@@ -7,8 +7,6 @@ For each phase of a test (set-up, call, tear-down) it takes the wall clock, the 
 ended children, and the time for which the process waited for a processor. The largest part is the reason.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Generator

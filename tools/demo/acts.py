@@ -1,7 +1,5 @@
 """What happens in the demo, at set times or by a key: a sensor goes off and on again, or the robot is carried away."""
 
-from __future__ import annotations
-
 import contextlib
 import select
 import socket

@@ -1,7 +1,5 @@
 """The folder that a demo leaves: map, recording and configuration, with the commands to go on."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

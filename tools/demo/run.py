@@ -8,8 +8,6 @@ do the same at any time. At the end map, recording and configuration lie in a fo
 nothing is left running.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib.util
@@ -36,6 +34,7 @@ from estimator import CACHE_DIR
 from tools.demo.acts import ROBOT, OrderRefused, Stage, complaint, keyboard, pressed, programme
 from tools.demo.folder import CONFIG, KEPT, RECORDING, SURVEY, Wiring, clear, keep
 from tools.demo.score import READY, Score, Track, cause, pose_of, summary, told, verdict
+from tools.sim.ports import NoFreePort, free_port
 
 ROOT: Final = Path(__file__).parents[2]
 READ_PERIOD_S: Final = 0.05
@@ -89,18 +88,6 @@ def stop(child: subprocess.Popen[str]) -> None:
             child.wait()
         if child.stdout is not None:
             child.stdout.close()
-
-
-def free_port() -> int:
-    """A port that is free on loopback for both TCP and UDP just now."""
-    for _ in range(50):
-        with socket.socket() as tcp, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-            tcp.bind(("127.0.0.1", 0))
-            port = int(tcp.getsockname()[1])
-            with contextlib.suppress(OSError):
-                udp.bind(("127.0.0.1", port))
-                return port
-    raise DemoError("no port is free on 127.0.0.1 for both TCP and UDP; close some programs")
 
 
 def write_config(folder: Path, modbus: int, odometry: int, lights: bool = True) -> Path:
@@ -315,7 +302,7 @@ def show(options: argparse.Namespace, folder: Path, out: Path) -> int:
         interrupted = True
         if not score.reads:
             return INTERRUPTED
-    except (DemoError, OrderRefused) as error:
+    except (DemoError, NoFreePort, OrderRefused) as error:
         wrong = str(error)
     figures = summary(score)
     early = interrupted and not score.error_m  # nothing is wrong with a run that had no time to show anything

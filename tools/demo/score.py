@@ -1,7 +1,5 @@
 """How good the published pose was: the truth of the same instant, errors, states, and a verdict."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -1,7 +1,5 @@
 """A simulated robot, its daemon and a page of it as processes; Debian's chromium, driven over its own protocol."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import base64
@@ -22,15 +20,8 @@ from typing import Any, Final
 from aiohttp import ClientSession, ClientWebSocketResponse
 
 from daemon.publish.modbus.client import Reader
-from tools.demo.run import (
-    Patience,
-    free_port,
-    running,
-    simulator_words,
-    wait_for_pose,
-    wait_for_simulator,
-    write_config,
-)
+from tools.demo.run import Patience, running, simulator_words, wait_for_pose, wait_for_simulator, write_config
+from tools.sim.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

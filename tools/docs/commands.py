@@ -1,7 +1,5 @@
 """``python -m tools.docs.commands``: the page docs/commands.md from the program's own parser."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from typing import Final

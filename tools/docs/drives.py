@@ -3,8 +3,6 @@
 Daemon and world run in one process and in virtual time, so a slow computer does not change the pictures.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import shutil

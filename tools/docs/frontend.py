@@ -4,8 +4,6 @@ Every figure follows from the parts below by the formula beside it; nothing here
 run it again; a test keeps the page equal to what this prints.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Needs chromium (`apt-get install chromium`). The robot drives under lamps for a 
 a desktop and as a phone show it.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import sys

@@ -3,8 +3,6 @@
 The floor is a hall of 30 m x 18 m with nothing in it but a pillar, and a corridor that leads off it.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import io

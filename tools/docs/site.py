@@ -1,7 +1,5 @@
 """Hooks of mkdocs (`mkdocs.yml`): anchors as on GitHub; links that leave the folder of pages become plain text."""
 
-from __future__ import annotations
-
 import posixpath
 import re
 from typing import Any, Final

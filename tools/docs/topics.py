@@ -3,8 +3,6 @@
 It has the headings of those pages, the keys of the configuration, the names of registers and the commands.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from itertools import groupby

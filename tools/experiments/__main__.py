@@ -7,8 +7,6 @@ without it, with the reason. Exit status: 0 all ran or were skipped, 1 one could
 does not change the status.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

@@ -6,8 +6,6 @@ lamps stand in a line two places fit; a prior of 0.5 m chooses, for all alike. A
 position, counts as 3 m: a robot would not believe it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final

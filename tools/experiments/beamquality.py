@@ -5,8 +5,6 @@ come to rest in a wrong place, every measure is asked about it, and about the ma
 nats per beam, the share of the beams that fit, and the share of the evidence that does not speak against the place.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from typing import Any, Final

@@ -8,8 +8,6 @@ setting off (at the corridor's end a robot turns round first, under two lamps, w
 beside it the Cramer-Rao bound of the same stretch (`corridor_bound`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -7,8 +7,6 @@ model with Gaussian errors the covariance of the Kalman filter that knows the tr
 centimetres in question this one is linear.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -5,8 +5,6 @@ as they lie at the end, at most 2 m apart in truth and more than 15 m of way apa
 are about), and loops that became constraints.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final

@@ -6,8 +6,6 @@ the corridor and in all, and that of the map's keyframes as they lie at the end.
 said of the submaps out of the pose graph (and out of the judgement of loops).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace

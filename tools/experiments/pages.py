@@ -1,7 +1,5 @@
 """Pages of results: one for each experiment that a folder holds, and ``README.md``, which says what there is."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -6,8 +6,6 @@ after 160 m. Nothing starts from the truth: the filter begins by itself and is s
 15 % off). Position is scored where the robot is at least 1 m from the walls, and everywhere.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any, Final
 

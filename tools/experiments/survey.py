@@ -5,8 +5,6 @@ those of a laser SLAM: the true ones with slow errors of 1 cm and 0.25 degrees (
 lamps truly hang, in the same frame; no alignment is done.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

@@ -8,8 +8,6 @@
 A table, out/soak/*.json and a graph; 1 where a bound is broken.
 """
 
-from __future__ import annotations
-
 import argparse
 import signal
 import time

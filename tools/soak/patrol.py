@@ -4,8 +4,6 @@ What the building looks like from each second of a lap, and what the lamps send 
 light and wheels is new every time.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

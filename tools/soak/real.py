@@ -1,7 +1,5 @@
 """Hours of the real processes: the daemon, which keeps maps and a recording, and the demo's simulator, in real time."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
@@ -22,12 +20,12 @@ from tools.demo.run import (
     SURVEY,
     DemoError,
     Patience,
-    free_port,
     running,
     wait_for_pose,
     wait_for_simulator,
     write_config,
 )
+from tools.sim.ports import free_port
 from tools.soak.watched import Watch
 
 ROW_S: Final = 20.0

@@ -1,7 +1,5 @@
 """Simulated days: the daemon's own cycle with its sinks, its clock put forward by hand, one scan a second."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import math

@@ -1,7 +1,5 @@
 """What is watched in a soak: one row after the other, a verdict over the slopes, a graph."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The commands `calibrate` and `survey`: what they say, write and refuse; drives are made without a recording here."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +23,7 @@ from estimator.light_filter.lambertian import expected
 from estimator.light_filter.residual_map import ResidualMap
 from estimator.numerics.se2 import between, compose
 from hal.errors import DataInvalid
+from tests.commands import Command
 from tests.estimator.calibration.test_odometry_calibration import TRUE
 from tests.estimator.calibration.test_odometry_calibration import drive as wheels_and_laser
 from tests.estimator.teach import drive as way
@@ -76,11 +75,10 @@ def played(taught: Drive, monkeypatch: pytest.MonkeyPatch) -> Drive:
 
 @pytest.mark.jit
 def test_calibrate_writes_a_better_survey_with_its_map(
-    played: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    played: Drive, tmp_path: Path, done: Command, refused: Command
 ) -> None:
     out = tmp_path / "new.toml"
-    assert parser.main(["calibrate", "teach", "--out", str(out)]) == console.OK
-    said = capsys.readouterr().out
+    said = done("calibrate", "teach", "--out", str(out))
     assert "before" in said
     assert "rx_slope_x" in said
     assert "yaw -22.9" in said  # -0.4 rad
@@ -93,17 +91,13 @@ def test_calibrate_writes_a_better_survey_with_its_map(
     assert read_residuals(residuals_beside(out), survey) is not None
     assert out.with_suffix(".png").stat().st_size > 10_000
     # nothing is overwritten unasked, and that is said before any work
-    assert parser.main(["calibrate", "teach", "--out", str(out)]) == console.FAILED
-    assert "--force" in capsys.readouterr().err
+    assert "--force" in refused("calibrate", "teach", "--out", str(out))
 
 
 @pytest.mark.jit
-def test_survey_writes_lamps_with_uncertainties(
-    played: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_survey_writes_lamps_with_uncertainties(played: Drive, tmp_path: Path, done: Command) -> None:
     out = tmp_path / "lights.toml"
-    assert parser.main(["survey", "teach", "--height", "2.9", "--out", str(out)]) == console.OK
-    assert "sigma m" in capsys.readouterr().out
+    assert "sigma m" in done("survey", "teach", "--height", "2.9", "--out", str(out))
     found = {lamp.code: lamp for lamp in read_survey(out).lamps}
     lamps = nominal(2).lamps
     assert set(found) == {lamp.code for lamp in lamps}
@@ -128,11 +122,8 @@ def driven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Drive:
     return drive
 
 
-def test_the_mount_is_written_as_a_configuration_with_a_picture(
-    driven: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert parser.main(["calibrate", "teach", "--lidar-mount"]) == console.OK
-    said = capsys.readouterr().out
+def test_the_mount_is_written_as_a_configuration_with_a_picture(driven: Drive, tmp_path: Path, done: Command) -> None:
+    said = done("calibrate", "teach", "--lidar-mount")
     out = tmp_path / "lumiloop-calibrated.toml"
     written = load(out)
     mount = written.lidar.mount
@@ -152,12 +143,9 @@ def test_the_mount_is_written_as_a_configuration_with_a_picture(
     assert parser.main(["check", str(out)]) == console.OK
 
 
-def test_what_the_wheels_told_is_at_the_head_of_the_configuration(
-    driven: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_the_wheels_told_is_at_the_head_of_the_configuration(driven: Drive, tmp_path: Path, done: Command) -> None:
     out = tmp_path / "robot.toml"
-    assert parser.main(["calibrate", "teach", "--odometry", "--out", str(out)]) == console.OK
-    said = capsys.readouterr().out
+    said = done("calibrate", "teach", "--odometry", "--out", str(out))
     assert "mount" not in said
     head = [line for line in out.read_text().splitlines() if line.startswith("#")]
     for name, true in zip(("scale", "turn", "drift"), (TRUE[0], TRUE[1], np.degrees(TRUE[2])), strict=True):
@@ -169,25 +157,23 @@ def test_what_the_wheels_told_is_at_the_head_of_the_configuration(
 
 
 def test_a_configuration_is_not_overwritten_unasked(
-    driven: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    driven: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Command
 ) -> None:
     out = tmp_path / "robot.toml"
     out.write_text("# hall 3\nname = 'mine'\n")
     words = ["calibrate", "teach", "--lidar-mount", "--out", str(out)]
-    assert parser.main(words) == console.FAILED
-    assert "--force" in capsys.readouterr().err
+    assert "--force" in refused(*words)
     assert out.read_text() == "# hall 3\nname = 'mine'\n"
     assert [file.name for file in tmp_path.iterdir()] == ["robot.toml"]
     assert parser.main([*words, "--force"]) == console.OK
     assert load(out).name == "r7"
     assert "# hall 3\n" in out.read_text(), "comments of the file stay"
     assert out.read_text().startswith("# Configuration of drive")
-    assert parser.main([*words[:-1], str(tmp_path / "nowhere" / "robot.toml")]) == console.FAILED
-    assert "cannot write" in capsys.readouterr().err
+    assert "cannot write" in refused(*words[:-1], str(tmp_path / "nowhere" / "robot.toml"))
 
 
 def test_what_is_missing_is_said(
-    played: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    played: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Command
 ) -> None:
     out = ["--out", str(tmp_path / "x.toml")]
     for change, words in (
@@ -198,11 +184,9 @@ def test_what_is_missing_is_said(
         fields = {name: getattr(played, name) for name in ("path", "poses", "survey", "epochs", "readings")}
         other = Drive(**{**fields, **change})
         monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_, other=other: other)
-        assert parser.main(["calibrate", "teach", *out]) == console.FAILED
-        assert words in capsys.readouterr().err
+        assert words in refused("calibrate", "teach", *out)
     monkeypatch.setattr(daemon.cli.calibrate, "read_drive", lambda *_: Drive(Path("t"), played.poses, played.survey))
-    assert parser.main(["calibrate", "teach", "--odometry"]) == console.FAILED
-    assert "the recording has no odometry" in capsys.readouterr().err
+    assert "the recording has no odometry" in refused("calibrate", "teach", "--odometry")
 
 
 def test_a_survey_for_another_air_interface_is_refused(
@@ -218,9 +202,8 @@ def test_a_survey_for_another_air_interface_is_refused(
     assert "lamp 7: code 65 is not in profile B, which has codes 0 to 64" in capsys.readouterr().err
 
 
-def test_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert parser.main(["calibrate", str(tmp_path / "none"), "--out", str(tmp_path / "x.toml")]) == console.FAILED
-    assert "none" in capsys.readouterr().err
+def test_no_recording(tmp_path: Path, refused: Command) -> None:
+    assert "none" in refused("calibrate", str(tmp_path / "none"), "--out", str(tmp_path / "x.toml"))
     assert parser.main(["survey", str(tmp_path / "none"), "--out", str(tmp_path / "x.toml")]) == console.FAILED
 
 

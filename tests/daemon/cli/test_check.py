@@ -1,7 +1,5 @@
 """`lumiloop check`: a good file, a bad survey, and a bus that is not here."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -12,6 +10,7 @@ from daemon.diagnosis import map_folder
 from daemon.maps.store import Store
 from daemon.system import console
 from daemon.system.folder_lock import FolderLock
+from tests.commands import Command
 from tests.daemon.support.map_maker import Shape, content
 
 SURVEY = """
@@ -29,10 +28,9 @@ def write(folder: Path, survey: str = SURVEY, bus: str = "/dev/i2c-99") -> Path:
     return file
 
 
-def test_all_good_but_the_bus_is_elsewhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_good_but_the_bus_is_elsewhere(tmp_path: Path, done: Command) -> None:
     file = write(tmp_path)
-    assert parser.main(["check", str(file)]) == console.OK
-    good, survey, bus, _ = capsys.readouterr().out.splitlines()
+    good, survey, bus, _ = done("check", str(file)).splitlines()
     assert good == f"{file}: good"
     assert survey == f"{tmp_path.resolve() / 'lights.toml'}: valid, 2 lamps"
     assert bus.startswith("from this computer, /dev/i2c-99: ")
@@ -130,10 +128,9 @@ def test_the_line_that_names_a_bad_survey_is_told(tmp_path: Path, capsys: pytest
     assert "(`lights.survey` names it)" in said
 
 
-def test_a_survey_that_nothing_looks_at_is_remarked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_survey_that_nothing_looks_at_is_remarked(tmp_path: Path, done: Command) -> None:
     file = write(tmp_path, bus="")
-    assert parser.main(["check", str(file)]) == console.OK
-    assert "the survey is not used, because `photodiode.bus` is empty" in capsys.readouterr().out
+    assert "the survey is not used, because `photodiode.bus` is empty" in done("check", str(file))
 
 
 @pytest.mark.parametrize(
@@ -146,20 +143,16 @@ def test_a_survey_that_nothing_looks_at_is_remarked(tmp_path: Path, capsys: pyte
         ("yaw = 90.0", ""),
     ],
 )
-def test_a_mount_in_other_units_is_remarked(
-    mount: str, remark: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mount_in_other_units_is_remarked(mount: str, remark: str, tmp_path: Path, done: Command) -> None:
     file = tmp_path / "robot.toml"
     file.write_text(f'map.folder = "none"\nlidar.mount = {{ {mount} }}\n')
-    assert parser.main(["check", str(file)]) == console.OK
-    assert capsys.readouterr().out.splitlines()[1:] == ([remark] if remark else [])
+    assert done("check", str(file)).splitlines()[1:] == ([remark] if remark else [])
 
 
-def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_cannot_be_made(tmp_path: Path, done: Command) -> None:
     file = tmp_path / "robot.toml"
     file.write_text('map.folder = "/proc/maps"\n')
-    assert parser.main(["check", str(file)]) == console.OK
-    assert "/proc/maps: this user cannot create the folder" in capsys.readouterr().out
+    assert "/proc/maps: this user cannot create the folder" in done("check", str(file))
 
 
 def test_the_folder_of_maps_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

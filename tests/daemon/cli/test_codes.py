@@ -1,7 +1,5 @@
 """`lumiloop codes`: its tables against the simulator's (built another way), and against what a C compiler reads."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

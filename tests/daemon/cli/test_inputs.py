@@ -1,7 +1,5 @@
 """The input of a command is opened and judged before a kernel is loaded or compiled."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

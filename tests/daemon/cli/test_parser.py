@@ -1,7 +1,5 @@
 """The command line's own behaviour: dispatch, exit codes, and that refusals are text, not tracebacks."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -17,15 +15,15 @@ from daemon.cli import inputs, parser
 from daemon.config.paths import maps_folder
 from daemon.config.schema import Config
 from daemon.system import console
+from tests.commands import Command
 
 ROOT = Path(__file__).parents[3]
 
 
-def test_check_good_and_bad(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_good_and_bad(tmp_path: Path, capsys: pytest.CaptureFixture[str], done: Command) -> None:
     file = tmp_path / "robot.toml"
     file.write_text("[modbus]\nport = 5020\n")
-    assert parser.main(["check", str(file)]) == console.OK
-    good, maps = capsys.readouterr().out.splitlines()
+    good, maps = done("check", str(file)).splitlines()
     assert good == f"{file}: good"
     assert maps == f"{maps_folder('')}: the folder does not exist yet; the daemon creates it for its maps"
     file.write_text("[modbus]\nport = 'x'\n")
@@ -33,11 +31,10 @@ def test_check_good_and_bad(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().err.startswith(f'lumiloop: {file}:2: `modbus.port` = "')
 
 
-def test_a_program_reads_what_check_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_program_reads_what_check_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str], done: Command) -> None:
     file = tmp_path / "robot.toml"
     file.write_text("[modbus]\nport = 5020\n")
-    assert parser.main(["check", str(file), "--json"]) == console.OK
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(done("check", str(file), "--json"))
     assert (told["schema"], told["file"], told["good"]) == ("lumiloop.check/1", str(file), True)
     file.write_text("[modbus]\nport = 'x'\n")
     assert parser.main(["check", str(file), "--json"]) == console.USAGE
@@ -59,19 +56,17 @@ def test_small_commands_load_neither_numpy_nor_numba(tmp_path: Path, words: list
     assert done.returncode == 0, done.stderr
 
 
-def test_print_config_resolves_file_and_overrides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_print_config_resolves_file_and_overrides(tmp_path: Path, done: Command) -> None:
     file = tmp_path / "robot.toml"
     file.write_text("name = 'r7'\n")
     words = ["run", "--config", str(file), "--lidar", "/dev/ttyACM1", "--set", "modbus.port=0", "--print-config"]
-    assert parser.main(words) == console.OK
-    printed = tomllib.loads(capsys.readouterr().out)
+    printed = tomllib.loads(done(*words))
     assert (printed["name"], printed["lidar"]["device"], printed["modbus"]["port"]) == ("r7", "/dev/ttyACM1", 0)
 
 
 @pytest.mark.parametrize("flag", ["--schema", "--reference", "--print-config", "--version"])
-def test_printed_facts(flag: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert parser.main([flag]) == console.OK
-    assert capsys.readouterr().out.endswith("\n")
+def test_printed_facts(flag: str, done: Command) -> None:
+    assert done(flag).endswith("\n")
 
 
 def test_no_command_shows_help_as_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:

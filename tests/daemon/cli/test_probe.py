@@ -1,7 +1,5 @@
 """`lumiloop probe`: what a person and a program read, for a sensor, for nothing, and for something else."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Sequence

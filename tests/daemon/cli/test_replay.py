@@ -1,7 +1,5 @@
 """`lumiloop replay` and `lumiloop map export` from the command line: results, repeatability, bad input."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import json
@@ -24,6 +22,7 @@ from hal.clock import LoopClock
 from hal.errors import DeviceFault
 from hal.replay.carmen import read_carmen
 from hal.replay.player import LogPlayer
+from tests.commands import Command
 from tests.daemon.replay.room import Drive, carmen, drive, read_tum, relative
 
 RESULTS = {
@@ -97,9 +96,8 @@ def test_the_summary_counts_and_names_what_was_used(out: Path, log: Path, run: D
     assert timing["times_real_time"] > 0
 
 
-def test_a_program_reads_the_summary(out: Path, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert parser.main(["replay", str(log), "--out", str(tmp_path / "json"), "--json"]) == console.OK
-    told = json.loads(capsys.readouterr().out)
+def test_a_program_reads_the_summary(out: Path, log: Path, tmp_path: Path, done: Command) -> None:
+    told = json.loads(done("replay", str(log), "--out", str(tmp_path / "json"), "--json"))
     assert told["schema"] == "lumiloop.replay/1"
     assert told == summary_of(out)
 
@@ -207,23 +205,21 @@ def test_stamps_that_run_backwards_stay_in_the_results(
         (b"1 2 3 4\n5 6 7 8\n", "not a CARMEN log"),
     ],
 )
-def test_a_log_of_another_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes, says: str) -> None:
+def test_a_log_of_another_kind(tmp_path: Path, refused: Command, content: bytes, says: str) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(content)
-    assert parser.main(["replay", str(path), "--out", str(tmp_path / "out")]) == console.FAILED
-    said = capsys.readouterr().err
+    said = refused("replay", str(path), "--out", str(tmp_path / "out"))
     assert says in said
     assert str(path) in said
 
 
 def test_a_missing_log_and_an_output_that_is_a_file(
-    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str], refused: Command
 ) -> None:
     assert parser.main(["replay", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == console.FAILED
     assert "none: no such file (check the path)" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
-    assert parser.main(["replay", str(log), "--out", str(tmp_path / "file")]) == console.FAILED
-    assert "is a file; name a folder" in capsys.readouterr().err
+    assert "is a file; name a folder" in refused("replay", str(log), "--out", str(tmp_path / "file"))
 
 
 def test_a_log_that_is_mostly_guessed_says_so_in_its_last_line(
@@ -274,11 +270,10 @@ def test_what_ends_a_replay_early_leaves_what_was_computed(
     assert summary_of(tmp_path)["complete"] is False
 
 
-def test_a_capture_without_scans_is_no_success(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_capture_without_scans_is_no_success(tmp_path: Path, refused: Command) -> None:
     path = tmp_path / "a.logr"
     path.write_bytes(bytes(7) + b"\x05" + (6).to_bytes(4, "big") + b"VV\n00P")
-    assert parser.main(["replay", str(path), "--out", str(tmp_path / "out")]) == console.FAILED
-    assert "does not contain a scan that gave a pose" in capsys.readouterr().err
+    assert "does not contain a scan that gave a pose" in refused("replay", str(path), "--out", str(tmp_path / "out"))
 
 
 def test_the_real_capture_gives_its_poses(log_root: Path, tmp_path: Path) -> None:

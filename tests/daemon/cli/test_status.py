@@ -1,7 +1,5 @@
 """`lumiloop status` against a running publisher, a silent host, a stranger."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import json
@@ -26,7 +24,7 @@ from daemon.publish.modbus import client, lights_block, registers
 from daemon.publish.modbus.parts_block import PARTS
 from daemon.publish.modbus.requests import BLOCKS
 from daemon.snapshot import Condition, DimmedLamp, Part, Snapshot, State, Thread, Trust
-from tests.daemon.publish.modbus.test_lights_block import picture
+from tests.daemon.publish.modbus.test_light_blocks import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import publishing
 

@@ -1,7 +1,5 @@
 """`lumiloop status --watch`: what is shown anew, and for how long."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -16,7 +14,7 @@ from daemon.cli.reports import terminal_screen
 from daemon.publish.modbus import client, registers
 from daemon.snapshot import Snapshot, Trust
 from tests.daemon.cli.test_status import run_against, status, stranger
-from tests.daemon.publish.modbus.test_lights_block import picture
+from tests.daemon.publish.modbus.test_light_blocks import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
 
 Frames = list[list[str]]

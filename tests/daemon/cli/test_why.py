@@ -1,7 +1,5 @@
 """`lumiloop why`: the command with real recordings, what it says of them and draws, and what it refuses."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -23,6 +21,7 @@ from daemon.system.versions import build
 from estimator.mapping.occupancy_grid import Grid
 from hal.odometry import RawOdometry
 from hal.replay.recording import Kind
+from tests.commands import Command
 from tests.daemon.replay.test_dump import let_write, unplugged
 from tests.daemon.replay.test_recorded_run import Bench, aged, pulled, record
 
@@ -31,20 +30,17 @@ ZONE = f"{datetime.fromtimestamp(AT, UTC).astimezone():%z}"
 
 
 def test_what_the_service_records_is_looked_for_where_we_have_recorded_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "ours"))
     monkeypatch.setattr(paths, "SERVICE_STATE", tmp_path / "service")
-    assert parser.main(["why", "3"]) == 1
-    said = capsys.readouterr().err
+    said = refused("why", "3")
     assert f"no recording was found in {tmp_path}/ours/flight or " in said
     assert f"--record {tmp_path}/ours/flight --last 10" in said
     (tmp_path / "service" / "flight").mkdir(parents=True)
-    assert parser.main(["why", "3"]) == 1
-    assert f"{tmp_path}/service/flight: holds no recording" in capsys.readouterr().err
+    assert f"{tmp_path}/service/flight: holds no recording" in refused("why", "3")
     (tmp_path / "ours" / "flight").mkdir(parents=True)
-    assert parser.main(["why", "3"]) == 1
-    assert f"{tmp_path}/ours/flight: holds no recording" in capsys.readouterr().err
+    assert f"{tmp_path}/ours/flight: holds no recording" in refused("why", "3")
 
 
 @pytest.mark.parametrize("named", [True, False])
@@ -204,7 +200,11 @@ def test_it_is_drawn_as_its_ending_says(
 
 
 def test_a_picture_that_cannot_be_had_is_refused_before_anything_is_replayed(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    refused: Command,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("daemon.cli.why.moments", lambda *_: pytest.fail("replayed"))
     with pytest.raises(SystemExit) as ended:
@@ -237,18 +237,11 @@ def test_a_picture_that_cannot_be_had_is_refused_before_anything_is_replayed(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["closed", "file", "folder.png"], "nothing stays"
     assert not list((tmp_path / "closed").iterdir())
     monkeypatch.setattr("daemon.cli.why.find_spec", lambda name: None)
-    assert parser.main(["why", "9", str(recorded), "--out", str(tmp_path / "why.png")]) == console.FAILED
-    assert "plots need matplotlib" in capsys.readouterr().err
+    assert "plots need matplotlib" in refused("why", "9", str(recorded), "--out", str(tmp_path / "why.png"))
 
 
-def test_for_a_time_that_is_none_no_folder_is_made(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert (
-        parser.main(["why", "nonsense", str(recorded), "--out", str(tmp_path / "by" / "typo" / "a.png")])
-        == console.FAILED
-    )
-    assert "not a time" in capsys.readouterr().err
+def test_for_a_time_that_is_none_no_folder_is_made(recorded: Path, tmp_path: Path, refused: Command) -> None:
+    assert "not a time" in refused("why", "nonsense", str(recorded), "--out", str(tmp_path / "by" / "typo" / "a.png"))
     assert not list(tmp_path.iterdir())
 
 
@@ -277,19 +270,17 @@ def test_the_picture_is_of_the_cycle_that_is_told(
 
 @pytest.mark.parametrize("lost", [{"t_utc": None}, {"t_mono": "soon"}, {"t_utc": float("nan")}, {"t_utc": 1e300}])
 def test_a_recording_whose_head_says_no_time_is_named_and_passed_over(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], lost: dict[str, object]
+    tmp_path: Path, refused: Command, lost: dict[str, object]
 ) -> None:
     """Records come a second apart; the second recording is whole."""
     for name, header in (("bad", lost), ("good", {})):
         writer = SegmentWriter(tmp_path, name, {"recording": name, "t_mono": 5.0, "t_utc": AT, **header})
         writer.put(Kind.RX, 0, 6.0, b"abc")
         writer.close()
-    assert parser.main(["why", "3600", str(tmp_path / "bad")]) == 1
-    said = capsys.readouterr().err
+    said = refused("why", "3600", str(tmp_path / "bad"))
     assert "bad: its head" in said
     assert "lumiloop replay" in said
-    assert parser.main(["why", "3600", str(tmp_path)]) == 1
-    said = capsys.readouterr().err
+    said = refused("why", "3600", str(tmp_path))
     assert "ignored" in said
     assert "available" in said
 
@@ -318,11 +309,8 @@ def test_wheels_that_slip_dissent(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize("named", ["nowhere", "nowhere/at/all"])
-def test_a_folder_that_is_not_there_is_said_to_be_none(
-    named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert parser.main(["why", "3", str(tmp_path / named)]) == 1
-    said = capsys.readouterr().err
+def test_a_folder_that_is_not_there_is_said_to_be_none(named: str, tmp_path: Path, refused: Command) -> None:
+    said = refused("why", "3", str(tmp_path / named))
     assert f"{tmp_path / named}: no such folder (name a recording, a dump, or a folder of several)" in said
 
 

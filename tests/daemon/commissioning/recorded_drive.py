@@ -1,7 +1,5 @@
 """A recorded teach drive: the whole daemon on the simulated robot under simulated lamps, in virtual time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Planning lamps: what is predicted against what the estimator's own model and solver do, and plans against rivals."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -25,6 +23,7 @@ from estimator.light_filter.lambertian import Wrt, expected
 from estimator.light_filter.survey import Lamp, Receiver, Survey
 from estimator.paper.lateration import locate
 from estimator.paper.lateration_model import Doubt, Received, SolverSettings
+from tests.commands import Command
 
 Cells = npt.NDArray[np.int8]
 FITTING = Fitting(2.2)
@@ -194,13 +193,10 @@ def write_pgm(folder: Path, cells: Cells, origin: str = "[1.0, -2.0, 0.0]") -> P
     return folder / "map.pgm"
 
 
-def test_the_command_writes_a_survey_that_it_can_judge_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_a_survey_that_it_can_judge_again(tmp_path: Path, done: Command) -> None:
     path = write_pgm(tmp_path, room(6.0, 5.0))
     words = ["plan", str(path), "--out", str(tmp_path / "plan"), "--height", "3.0", "--lamps", "9", "--spacing", "0.8"]
-    assert parser.main(words) == console.OK
-    said = capsys.readouterr().out
+    said = done(*words)
     assert "lamps: 9, one for every" in said
     survey = read_survey(tmp_path / "plan" / "lights.toml")
     assert len({lamp.code for lamp in survey.lamps}) == 9
@@ -208,14 +204,12 @@ def test_the_command_writes_a_survey_that_it_can_judge_again(
     assert all(1.0 < lamp.x < 7.6 and -2.0 < lamp.y < 3.6 for lamp in survey.lamps), "in the map frame"
     assert (tmp_path / "plan" / "plan.png").read_bytes().startswith(b"\x89PNG")
     judged = ["plan", str(path), "--out", str(tmp_path / "b"), "--survey", str(tmp_path / "plan" / "lights.toml")]
-    assert parser.main(judged) == console.OK
-    again = capsys.readouterr().out
+    again = done(*judged)
     assert [line for line in said.splitlines() if line.startswith("lidar and light")] == [
         line for line in again.splitlines() if line.startswith("lidar and light")
     ]
     assert not (tmp_path / "b" / "lights.toml").exists()
-    assert parser.main([*judged, "--json"]) == console.OK
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(done(*judged, "--json"))
     assert (told["schema"], told["lamps"]["count"]) == ("lumiloop.plan/1", 9)
     places = {(lamp.x, lamp.y) for lamp in survey.lamps}
     assert {(at["x_m"], at["y_m"]) for at in told["lamps"]["positions"]} == places

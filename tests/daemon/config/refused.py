@@ -1,7 +1,5 @@
 """A configuration that is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Changes of values in the text of a configuration: the value changes, everything else stays."""
 
-from __future__ import annotations
-
 import tomllib
 
 import pytest

@@ -1,7 +1,5 @@
 """What is said of a configuration that is wrong: all of it at once, in words for who writes the file."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

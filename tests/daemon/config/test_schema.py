@@ -1,7 +1,5 @@
 """The configuration tree: few options, precise refusals, and a print that can be pasted back."""
 
-from __future__ import annotations
-
 import ast
 import json
 from pathlib import Path

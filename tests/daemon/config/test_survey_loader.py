@@ -1,7 +1,5 @@
 """The light survey as a file: what is written reads back, and whatever is wrong is named with place and remedy."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Device units to SI: signs, frames, codes, masks, stamps, and odometry that jumps, pauses or runs backwards."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The stored sample clock: kept for its converter; passed over where it is missing, damaged or cannot be written."""
 
-from __future__ import annotations
-
 import json
 import logging
 import threading

@@ -1,7 +1,5 @@
 """The doctor, on a computer on which one thing after the other is broken."""
 
-from __future__ import annotations
-
 import argparse
 import errno
 import json

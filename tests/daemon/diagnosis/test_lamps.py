@@ -1,7 +1,5 @@
 """Lamp maintenance: histories of lamps whose fate is known, gathered from maps and judged."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

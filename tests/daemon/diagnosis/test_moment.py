@@ -1,7 +1,5 @@
 """Which cycle `lumiloop why` takes for a time, and how it says which time that is."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime

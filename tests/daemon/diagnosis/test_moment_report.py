@@ -1,7 +1,5 @@
 """What `lumiloop why` says of cycles, and which of them it takes for a time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """`lumiloop why` of recordings in which the clock was set, or which end as a kill or a power cut leaves them."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which moment `lumiloop why` takes for what somebody writes, and in which recording."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path

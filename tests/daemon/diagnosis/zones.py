@@ -1,7 +1,5 @@
 """The place whose time it is, for what tells local times."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

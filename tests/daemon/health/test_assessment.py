@@ -1,7 +1,5 @@
 """Faults from vitals: each appears and goes with its cause, the gravest first, said once each way."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Load is one fault: what follows from it stands below it, in the list of faults and in the log."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Lines of the state: each change of a quiet run, a few of a run that flickers, and always the last one."""
 
-from __future__ import annotations
-
 import logging
 import re
 

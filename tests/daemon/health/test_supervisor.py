@@ -1,7 +1,5 @@
 """Parts that fail are restarted, ever more slowly; loss and return are said once."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable
@@ -111,15 +109,12 @@ def test_after_a_long_good_run_the_back_off_starts_anew() -> None:
     assert starts[5] - starts[4] > 4.0
 
 
-def test_cancelling_is_no_failure() -> None:
-    async def go() -> Supervisor:
-        supervisor = Supervisor()
-        autosaver = asyncio.create_task(supervisor.keep("pose", asyncio.Event().wait))  # type: ignore[arg-type]  # waits
-        await asyncio.sleep(1.0)
-        autosaver.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await autosaver
-        return supervisor
-
-    supervisor = run_virtual(go())
+@pytest.mark.virtual
+async def test_cancelling_is_no_failure() -> None:
+    supervisor = Supervisor()
+    autosaver = asyncio.create_task(supervisor.keep("pose", asyncio.Event().wait))  # type: ignore[arg-type]  # waits
+    await asyncio.sleep(1.0)
+    autosaver.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await autosaver
     assert (supervisor.restarts.total(), supervisor.failed) == (0, set())

@@ -1,7 +1,5 @@
 """Threads that hang: which are said, which keep the watchdog from being fed; and the condition that is published."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import threading

@@ -1,7 +1,5 @@
 """The autosaver of maps with its clock, its folder and its robot in hand."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@ A child saves one map after the other and tells each that is done; after a rando
 then must be a whole map: the last that was told, or the one after it. Prints what was found, as JSON.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

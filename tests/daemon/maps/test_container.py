@@ -1,7 +1,5 @@
 """The bytes of a map file: round trip, every kind of damage, versions, torn maps, other surveys."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The pose that is kept for the next start: what is written, what survives a kill in mid-write, what is passed over."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import os

@@ -1,7 +1,5 @@
 """Kills at random moments of writing the pose: the file always holds a whole one, and never an older one than seen."""
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys

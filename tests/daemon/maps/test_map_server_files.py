@@ -1,7 +1,5 @@
 """What the files of an imported map may be: their kind, their size, where links lead, and the time they take."""
 
-from __future__ import annotations
-
 import io
 import sys
 import time

@@ -1,7 +1,5 @@
 """A map that ends every start is left out after three, and moved aside once a start without it has lasted."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import json

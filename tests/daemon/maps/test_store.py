@@ -1,7 +1,5 @@
 """The folder of maps: which is loaded, which are kept, and what becomes of those that cannot be used."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The folder of maps: one process at a time, and disks that are full, lie, or vanish."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import logging

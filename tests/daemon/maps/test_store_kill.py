@@ -1,7 +1,5 @@
 """A process is killed while it saves its map: what is on the disk then is the old map or the new one."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """SWITCH_MAP: the whole daemon goes on in another stored map, found in it by itself, and the replay repeats it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Callable
@@ -32,7 +30,7 @@ from daemon.system import console
 from estimator.mapping.map_snapshot import MapImage
 from estimator.numerics import se2
 from estimator.stored_map import restored
-from hal.clock import LoopClock, run_virtual
+from hal.clock import LoopClock
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.models import URG_04LX_UG01
 from hal.fake.lidar.scan_world import Room
@@ -111,7 +109,8 @@ def error_m(snapshots: list[Snapshot], T: Any) -> float:
 
 @pytest.mark.jit
 @pytest.mark.parametrize("localise", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_the_robot_goes_on_in_another_map_and_the_replay_repeats_it(
+@pytest.mark.virtual
+async def test_the_robot_goes_on_in_another_map_and_the_replay_repeats_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], localise: bool
 ) -> None:
     maps, first, second = folder_of_two(tmp_path, capsys)
@@ -120,21 +119,16 @@ def test_the_robot_goes_on_in_another_map_and_the_replay_repeats_it(
         modbus=ModbusConfig(port=0),
         map=MapConfig(folder=str(maps), localise=localise),
     )
-
-    async def go() -> Bench:
-        bench = Bench(settings, tmp_path / "rec")
-        stop = asyncio.Event()
-        running = asyncio.create_task(bench.daemon.run(stop))
-        await asyncio.sleep(20.0)
-        assert await bench.switch(second) == switching.IN_USE
-        assert "no map 00000bad in" in await bench.switch(0xBAD)
-        assert await bench.switch(first) == ""
-        await asyncio.sleep(35.0)
-        stop.set()
-        await asyncio.wait_for(running, 10.0)
-        return bench
-
-    bench = run_virtual(go())
+    bench = Bench(settings, tmp_path / "rec")
+    stop = asyncio.Event()
+    running = asyncio.create_task(bench.daemon.run(stop))
+    await asyncio.sleep(20.0)
+    assert await bench.switch(second) == switching.IN_USE
+    assert "no map 00000bad in" in await bench.switch(0xBAD)
+    assert await bench.switch(first) == ""
+    await asyncio.sleep(35.0)
+    stop.set()
+    await asyncio.wait_for(running, 10.0)
     posed = [one for one in bench.snapshots if one.pose is not None]
     at = next(number for number, one in enumerate(posed) if one.map_id == first)
     assert {one.map_id for one in posed[:at]} == {second}
@@ -154,7 +148,8 @@ def test_the_robot_goes_on_in_another_map_and_the_replay_repeats_it(
 
 @pytest.mark.jit
 @pytest.mark.parametrize("generations", [2, 1])
-def test_a_map_that_nothing_can_be_begun_with_is_moved_aside_and_the_one_before_it_is_used(
+@pytest.mark.virtual
+async def test_a_map_that_nothing_can_be_begun_with_is_moved_aside_and_the_one_before_it_is_used(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, generations: int
 ) -> None:
     maps, first, _ = folder_of_two(tmp_path, capsys)
@@ -177,27 +172,22 @@ def test_a_map_that_nothing_can_be_begun_with_is_moved_aside_and_the_one_before_
 
     monkeypatch.setattr("estimator.restored", raising)
     settings = Config(lidar=LidarConfig(device=DEVICE), modbus=ModbusConfig(port=0), map=MapConfig(folder=str(maps)))
-
-    async def go() -> Bench:
-        bench = Bench(settings, tmp_path / "rec")
-
-        def there() -> bool:
-            ids = {one.map_id for one in bench.snapshots[-1:]}
-            return broken.exists() and (generations == 1 or first in ids)
-
-        stop = asyncio.Event()
-        running = asyncio.create_task(bench.daemon.run(stop))
-        while not there():  # noqa: ASYNC110 - virtual time
-            await asyncio.sleep(0.02)  # a thread of real time reads maps, and a loaded machine gives it its time
-        used.append(len(bench.snapshots))
-        await asyncio.sleep(6.0)
-        stop.set()
-        await asyncio.wait_for(running, 10.0)
-        return bench
-
     used: list[int] = []
     broken = bad.with_name(bad.name + ".broken")
-    bench = run_virtual(go())
+    bench = Bench(settings, tmp_path / "rec")
+
+    def there() -> bool:
+        ids = {one.map_id for one in bench.snapshots[-1:]}
+        return broken.exists() and (generations == 1 or first in ids)
+
+    stop = asyncio.Event()
+    running = asyncio.create_task(bench.daemon.run(stop))
+    while not there():  # noqa: ASYNC110 - virtual time
+        await asyncio.sleep(0.02)  # a thread of real time reads maps, and a loaded machine gives it its time
+    used.append(len(bench.snapshots))
+    await asyncio.sleep(6.0)
+    stop.set()
+    await asyncio.wait_for(running, 10.0)
     assert not bad.exists()
     ids = {one.map_id for one in bench.snapshots[used[0] + 5 :] if one.pose is not None}
     if generations == 2:
@@ -279,7 +269,9 @@ def test_a_defect_and_a_full_disk_change_nothing_and_are_told(tmp_path: Path, ca
     assert "switching the map has failed" in caplog.text
 
 
-def test_a_map_that_no_cycle_takes_is_taken_back_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_map_that_no_cycle_takes_is_taken_back_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Lidar and wheels are silent: no record comes, so nothing is stepped. The next order is free to be given."""
     from daemon.maps.schema import read
 
@@ -288,23 +280,19 @@ def test_a_map_that_no_cycle_takes_is_taken_back_and_told(tmp_path: Path, monkey
     map_id = read(data).meta.map_id
     (tmp_path / f"map-{map_id:08x}-00000001.lumimap").write_bytes(data)
     handed: list[switching.Switch | None] = []
-
-    async def go() -> list[str]:
-        made = Maps(Store(tmp_path), unjudged, lambda start: start)  # type: ignore[arg-type,return-value]  # never used
-        switch = MapSwitch(made, Quiet(), lambda one, _: handed.append(one))  # type: ignore[arg-type]  # as above
-        ended: list[str] = []
-        for count in (1, 2):
-            switch.ask(map_id, ended.append)
-            while len(ended) < count:  # noqa: ASYNC110 - a thread ends it
-                await asyncio.sleep(0.005)
-            await asyncio.sleep(0)
-        return ended
-
-    assert asyncio.run(go()) == [switching.NOTHING_COMES] * 2
+    made = Maps(Store(tmp_path), unjudged, lambda start: start)  # type: ignore[arg-type,return-value]  # never used
+    switch = MapSwitch(made, Quiet(), lambda one, _: handed.append(one))  # type: ignore[arg-type]  # as above
+    ended: list[str] = []
+    for count in (1, 2):
+        switch.ask(map_id, ended.append)
+        while len(ended) < count:  # noqa: ASYNC110 - a thread ends it
+            await asyncio.sleep(0.005)
+        await asyncio.sleep(0)
+    assert ended == [switching.NOTHING_COMES] * 2
     assert [one if one is None else one.map_id for one in handed] == [map_id, None] * 2
 
 
-def test_a_start_waits_for_the_lidar_with_the_map_that_it_has_fallen_back_on(
+async def test_a_start_waits_for_the_lidar_with_the_map_that_it_has_fallen_back_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A lidar that is switched on with the robot, or later, gives no scan within the time that an order has."""
@@ -314,20 +302,17 @@ def test_a_start_waits_for_the_lidar_with_the_map_that_it_has_fallen_back_on(
     (tmp_path / f"map-{map_id:08x}-00000001.lumimap").write_bytes(data)
     handed: list[switching.Switch | None] = []
 
-    async def go() -> list[str]:
-        def put(one: switching.Switch | None, taken: Callable[[], None]) -> None:
-            handed.append(one)
-            asyncio.get_running_loop().call_later(0.1, taken)
+    def put(one: switching.Switch | None, taken: Callable[[], None]) -> None:
+        handed.append(one)
+        asyncio.get_running_loop().call_later(0.1, taken)
 
-        made = Maps(Store(tmp_path), unjudged, lambda start: start)  # type: ignore[arg-type,return-value]  # never used
-        switch = MapSwitch(made, Quiet(), put)  # type: ignore[arg-type]  # all that is asked of it
-        ended: list[str] = []
-        switch.ask(map_id, ended.append, patient=True)
-        while not ended:  # noqa: ASYNC110 - a thread ends it
-            await asyncio.sleep(0.005)
-        return ended
-
-    assert asyncio.run(go()) == [""]
+    made = Maps(Store(tmp_path), unjudged, lambda start: start)  # type: ignore[arg-type,return-value]  # never used
+    switch = MapSwitch(made, Quiet(), put)  # type: ignore[arg-type]  # all that is asked of it
+    ended: list[str] = []
+    switch.ask(map_id, ended.append, patient=True)
+    while not ended:  # noqa: ASYNC110 - a thread ends it
+        await asyncio.sleep(0.005)
+    assert ended == [""]
     assert len(handed) == 1
 
 

@@ -1,7 +1,5 @@
 """Hold a running process to a share of one core, by whatever this machine offers: control groups, else stop and go."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """The first start ever, from an empty folder of kernels: once it drives, nothing is compiled any more."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import subprocess

@@ -1,7 +1,5 @@
 """A daemon that is killed: the next one knows where the robot stands, from what the last one kept as it drove."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The real program with a photodiode: its bus on a unix socket, real time, the status a person reads, what it keeps."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os

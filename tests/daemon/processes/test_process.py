@@ -1,7 +1,5 @@
 """The real program as a process of its own: the fake sensor on a pty, real sockets, real time, signals."""
 
-from __future__ import annotations
-
 import json
 import os
 import select

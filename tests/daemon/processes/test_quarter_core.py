@@ -1,11 +1,8 @@
 """The real program under load: 1081 beams at 40 Hz, 41 coded lamps and wheels, with a quarter of one core to itself."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -25,6 +22,7 @@ from estimator.cdma.air_interface import PROFILE_A
 from estimator.light_filter.survey import Survey
 from tests.daemon.processes.cpu_quota import PERIOD_US, cpu_s, held_back
 from tests.daemon.processes.test_process import ROOT, Running, running
+from tools.sim.ports import free_port
 
 # real time without slack: for a machine that does nothing else, so not among the quick system tests
 pytestmark = [pytest.mark.realtime, pytest.mark.system, pytest.mark.slow]
@@ -68,12 +66,6 @@ def prefer(pid: int) -> None:
     """Ahead of everything else on this machine, where that is allowed: what is to be seen is the limit's effect."""
     with suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, pid, -15)
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 @dataclass

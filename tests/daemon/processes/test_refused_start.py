@@ -1,7 +1,5 @@
 """A start that comes to nothing: the service manager is let wait, a stop ends that, and a terminal is told at once."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

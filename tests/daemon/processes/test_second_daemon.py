@@ -1,7 +1,5 @@
 """A daemon that is started beside one of the same name says so before anything is refused to it."""
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The store in a real process: saved on command and at the stop, loaded at the next start, refused where it must be."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys

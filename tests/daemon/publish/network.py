@@ -1,7 +1,5 @@
 """A running publisher and raw clients, for tests over real loopback sockets."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import socket

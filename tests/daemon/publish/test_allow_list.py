@@ -1,7 +1,5 @@
 """Who is answered: the list, this computer, and a log that a crowd does not fill."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

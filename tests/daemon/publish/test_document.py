@@ -1,7 +1,5 @@
 """The pages under docs/ are what the tables say now."""
 
-from __future__ import annotations
-
 import re
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """ActiveFaults and odometry that come in over Modbus and UDP, through real sockets to the estimate and back."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math
@@ -33,14 +31,9 @@ from hal.fake.lidar.scan_world import Room
 from hal.fake.transport.memory_host import FakeOpener
 from hal.net.inet import numeric
 from hal.net.input_codec import IMU_MAGIC, ODOMETRY_MAGIC, InputDatagram, encode
+from tools.sim.ports import free_port
 
 T = TypeVar("T")
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 async def outside(work: Callable[[], T]) -> T:
@@ -146,18 +139,15 @@ def test_a_plc_sets_the_pose_and_is_told_when_it_is_done() -> None:
     run_virtual(go())
 
 
-def test_a_plc_may_not_write_unless_it_is_allowed_to() -> None:
+@pytest.mark.virtual
+async def test_a_plc_may_not_write_unless_it_is_allowed_to() -> None:
     port = free_port()
-
-    async def go() -> bytes:
-        bench = Bench(settings(modbus=ModbusConfig(port=port)))
-        with closing(Plc(port)) as plc:
-            await asyncio.sleep(1.0)
-            answer = await outside(lambda: plc.ask(struct.pack(">BHHBH", 16, COMMAND_ADDRESS, 1, 2, 1)))
-        await bench.end()
-        return answer
-
-    assert run_virtual(go())[0] == 0x80 + 16
+    bench = Bench(settings(modbus=ModbusConfig(port=port)))
+    with closing(Plc(port)) as plc:
+        await asyncio.sleep(1.0)
+        answer = await outside(lambda: plc.ask(struct.pack(">BHHBH", 16, COMMAND_ADDRESS, 1, 2, 1)))
+    await bench.end()
+    assert answer[0] == 0x80 + 16
 
 
 @pytest.mark.virtual
@@ -190,23 +180,20 @@ async def test_datagrams_of_odometry_and_gyro_reach_the_cycle_and_poses_go_out()
         await bench.end()
 
 
-def test_a_receiver_that_cannot_be_sent_to_is_a_fault_until_it_can_be(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.virtual
+async def test_a_receiver_that_cannot_be_sent_to_is_a_fault_until_it_can_be(caplog: pytest.LogCaptureFixture) -> None:
     """As with the network's cable pulled: named by its number, one warning, and one line when it is over."""
     caplog.set_level(logging.INFO)
-
-    async def go() -> tuple[tuple[Fault, ...], ...]:
-        pose = PoseConfig(receivers=("255.255.255.255:5600",))  # nothing may be sent there: Permission denied
-        bench = Bench(settings(pose=pose, modbus=ModbusConfig(port=0), map=MapConfig(folder="none")))
-        await asyncio.sleep(6.0)
-        before, sender = bench.daemon.heartbeat.faults, bench.daemon.network.pose
-        assert sender is not None
-        (sender.receivers[0].address,) = numeric("127.0.0.1", free_port())
-        await asyncio.sleep(6.0)
-        after = bench.daemon.heartbeat.faults
-        await bench.end()
-        return before, after
-
-    assert run_virtual(go()) == ((Fault.PUBLISHER_FAILED,), ())
+    pose = PoseConfig(receivers=("255.255.255.255:5600",))  # nothing may be sent there: Permission denied
+    bench = Bench(settings(pose=pose, modbus=ModbusConfig(port=0), map=MapConfig(folder="none")))
+    await asyncio.sleep(6.0)
+    before, sender = bench.daemon.heartbeat.faults, bench.daemon.network.pose
+    assert sender is not None
+    (sender.receivers[0].address,) = numeric("127.0.0.1", free_port())
+    await asyncio.sleep(6.0)
+    after = bench.daemon.heartbeat.faults
+    await bench.end()
+    assert (before, after) == ((Fault.PUBLISHER_FAILED,), ())
     warned = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(warned) == 1
     assert "fault 401: " in warned[0]
@@ -214,15 +201,13 @@ def test_a_receiver_that_cannot_be_sent_to_is_a_fault_until_it_can_be(caplog: py
     assert "over: fault 401: " in caplog.text
 
 
-def test_without_any_socket_the_daemon_runs_for_its_sinks() -> None:
-    async def go() -> list[Snapshot]:
-        bench = Bench(settings(modbus=ModbusConfig(port=0)))
-        assert list(bench.daemon.network.parts) == []
-        await asyncio.sleep(6.0)
-        await bench.end()
-        return bench.snapshots
-
-    assert run_virtual(go())[-1].state is State.TRACKING
+@pytest.mark.virtual
+async def test_without_any_socket_the_daemon_runs_for_its_sinks() -> None:
+    bench = Bench(settings(modbus=ModbusConfig(port=0)))
+    assert list(bench.daemon.network.parts) == []
+    await asyncio.sleep(6.0)
+    await bench.end()
+    assert bench.snapshots[-1].state is State.TRACKING
 
 
 @pytest.mark.virtual

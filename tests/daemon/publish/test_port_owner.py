@@ -1,7 +1,5 @@
 """Who answers at a port, told from a made-up /proc."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The reference clients against the daemon's own ends: written from the documents, they share no code with it."""
 
-from __future__ import annotations
-
 import asyncio
 import shutil
 import socket
@@ -22,7 +20,7 @@ from hal.clock import SystemClock
 from hal.imu import RawImu
 from hal.net.inputs import InputPort
 from hal.odometry import RawOdometry
-from tests.daemon.publish.modbus.test_lights_block import picture
+from tests.daemon.publish.modbus.test_light_blocks import picture
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import publishing, until
 from tools.clients import read_lights, read_modbus, send_command, send_odometry, subscribe_pose
@@ -128,7 +126,7 @@ async def test_odometry_sender() -> None:
     assert [i.yaw_rate for i in imu] == [0.25] * 5
 
 
-def test_subscriber() -> None:
+async def test_subscriber() -> None:
     def read(port: int, ready: threading.Event) -> list[dict[str, float | int | str | None]]:
         subscription = subscribe_pose.Subscription("127.0.0.1", port)
         taken = []
@@ -140,22 +138,19 @@ def test_subscriber() -> None:
         subscription.close()
         return taken
 
-    async def run() -> list[dict[str, float | int | str | None]]:
-        server = Subscriptions("127.0.0.1", 0, lambda _: True)
-        await server.start()
-        sender = PoseSender([], "", server)
-        reading = asyncio.create_task(asyncio.to_thread(read, server.port, threading.Event()))
-        number = 0
-        async with asyncio.timeout(10.0):
-            while not reading.done():
-                number += len(server.leases)
-                sender.publish(snapshot(seq=number, pose=None if number == 2 else (1.2345, -2.3456, 3.0)))
-                await asyncio.sleep(0.01)
-            await until(lambda: len(server.leases) == 0)
-        await server.close()
-        return reading.result()
-
-    first, second, third = asyncio.run(run())
+    server = Subscriptions("127.0.0.1", 0, lambda _: True)
+    await server.start()
+    sender = PoseSender([], "", server)
+    reading = asyncio.create_task(asyncio.to_thread(read, server.port, threading.Event()))
+    number = 0
+    async with asyncio.timeout(10.0):
+        while not reading.done():
+            number += len(server.leases)
+            sender.publish(snapshot(seq=number, pose=None if number == 2 else (1.2345, -2.3456, 3.0)))
+            await asyncio.sleep(0.01)
+        await until(lambda: len(server.leases) == 0)
+    await server.close()
+    first, second, third = reading.result()
     assert first == {
         "seq": first["seq"], "state": "TRACKING", "reason": 7, "fault": 9, "x": 1.2345, "y": -2.3456, "yaw": 3.0,
     }  # fmt: skip

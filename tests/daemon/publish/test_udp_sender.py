@@ -1,7 +1,5 @@
 """Pose datagrams: to every receiver, never waiting, whatever the network says."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import errno

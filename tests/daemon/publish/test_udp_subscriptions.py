@@ -1,7 +1,5 @@
 """Pose datagrams by subscription: the bytes, the leases, the cookie, and real sockets."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import socket
@@ -26,7 +24,6 @@ from daemon.publish.udp_subscriptions import (
     decode,
     encode,
 )
-from hal.clock import run_virtual
 from hal.errors import DeviceMissing, DeviceRefused
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import until
@@ -231,7 +228,7 @@ def test_a_port_that_cannot_be_had_names_the_key() -> None:
         asyncio.run(run("192.0.2.1", 5000))
 
 
-def test_a_group_gets_datagrams_once_for_all() -> None:
+async def test_a_group_gets_datagrams_once_for_all() -> None:
     """Multicast over the loopback interface: two listeners, one datagram sent."""
     group = "239.255.76.77"
     listeners = []
@@ -247,32 +244,24 @@ def test_a_group_gets_datagrams_once_for_all() -> None:
             pytest.skip(f"this computer has no multicast on loopback: {error}")
         sock.settimeout(5.0)
         listeners.append(sock)
-
-    async def run() -> PoseSender:
-        sender = PoseSender([f"{group}:{listeners[0].getsockname()[1]}"], "127.0.0.1")
-        await sender.start()
-        sender.publish(snapshot(seq=5))
-        await sender.close()
-        return sender
-
-    (receiver,) = asyncio.run(run()).receivers
+    sender = PoseSender([f"{group}:{listeners[0].getsockname()[1]}"], "127.0.0.1")
+    await sender.start()
+    sender.publish(snapshot(seq=5))
+    await sender.close()
+    (receiver,) = sender.receivers
     assert (receiver.sent, receiver.dropped) == (1, 0)
     for sock in listeners:
         assert registers.decode_datagram(sock.recv(512))["seq"] == 5
         sock.close()
 
 
-def test_an_interface_that_has_gone_is_said(caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_interface_that_has_gone_is_said(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)  # the fault that follows from it is the warning
-
-    async def run() -> PoseSender:
-        sender = PoseSender(["239.255.76.77:5000"], "192.0.2.1")
-        await sender.start()
-        sender.publish(snapshot())
-        await sender.close()
-        return sender
-
-    (receiver,) = asyncio.run(run()).receivers
+    sender = PoseSender(["239.255.76.77:5000"], "192.0.2.1")
+    await sender.start()
+    sender.publish(snapshot())
+    await sender.close()
+    (receiver,) = sender.receivers
     assert receiver.dropped == 1
     assert "239.255.76.77:5000: Cannot assign requested address" in caplog.text
 
@@ -294,15 +283,13 @@ class _Fickle:
         self._cookie = decode(data).cookie
 
 
-def test_one_who_comes_and_goes_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    async def body() -> None:
-        subscriptions, sock = Subscriptions("127.0.0.1", 0, lambda _: True), _Fickle(100)
-        await asyncio.sleep(1.0)
-        while sock._left:
-            subscriptions._serve(sock)  # type: ignore[arg-type]  # all that is asked of a socket
-
+@pytest.mark.virtual
+async def test_one_who_comes_and_goes_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    run_virtual(body())
+    subscriptions, sock = Subscriptions("127.0.0.1", 0, lambda _: True), _Fickle(100)
+    await asyncio.sleep(1.0)
+    while sock._left:
+        subscriptions._serve(sock)  # type: ignore[arg-type]  # all that is asked of a socket
     assert [record.message for record in caplog.records] == [
         "pose datagrams: 1 subscribers, latest request from 192.0.2.7:4000"
     ]

@@ -1,7 +1,5 @@
 """What a cycle pays for a state that is taken: little, however many submaps there are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """A decoder among PWM-dimmed, slow and equal lamps goes on from a state as it would have without a stop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

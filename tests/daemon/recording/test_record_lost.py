@@ -1,7 +1,5 @@
 """How much of a recording a kill or a power cut costs, at the writing thread's own pace, in time of the test's own."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The recorder: it keeps what passes, never delays or stops the daemon, and says what it had to leave out."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import math

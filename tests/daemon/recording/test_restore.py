@@ -1,7 +1,5 @@
 """A state file from anywhere: what it may make, and that no file takes more memory or time than its size allows."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

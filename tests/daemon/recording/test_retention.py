@@ -1,7 +1,5 @@
 """The autosaver of a recording's folder: what it takes away where states cannot be had, and which dumps it keeps."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -1,7 +1,5 @@
 """The schema of states follows from the dataclasses: each field has a type that a state can hold."""
 
-from __future__ import annotations
-
 import ast
 import collections.abc
 import inspect

@@ -1,7 +1,5 @@
 """A room with known walls, a drive through it, and logs of that drive, made for the tests of replay."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

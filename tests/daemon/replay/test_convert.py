@@ -1,7 +1,5 @@
 """Recorded data of other formats become logs that say the same."""
 
-from __future__ import annotations
-
 import gzip
 import math
 from pathlib import Path
@@ -15,6 +13,7 @@ from daemon.replay import convert
 from hal.lidar import VALID, RawScan
 from hal.odometry import RawOdometry
 from hal.replay.carmen import CarmenLog, read_carmen
+from tests.commands import Command
 
 RNG = np.random.default_rng(3)
 
@@ -150,11 +149,10 @@ def test_what_cannot_be_converted_is_named(
     assert not (tmp_path / "b.log").exists()
 
 
-def test_a_log_that_is_read_as_it_is_needs_no_conversion(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_that_is_read_as_it_is_needs_no_conversion(tmp_path: Path, refused: Command) -> None:
     write_dat(tmp_path / "a.dat")
     assert parser.main(["convert", str(tmp_path / "a.dat"), str(tmp_path / "b.log")]) == 0
-    assert parser.main(["convert", str(tmp_path / "b.log"), str(tmp_path / "c.log")]) == 1
-    said = capsys.readouterr().err
+    said = refused("convert", str(tmp_path / "b.log"), str(tmp_path / "c.log"))
     assert "b.log: a CARMEN log needs no conversion" in said
     assert "lumiloop replay" in said
 
@@ -212,10 +210,9 @@ def test_an_npz_of_another_shape(tmp_path: Path) -> None:
         convert.read(tmp_path / "b.npz")
 
 
-def test_an_output_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_output_that_cannot_be_written(tmp_path: Path, refused: Command) -> None:
     write_dat(tmp_path / "a.dat", 3)
-    assert parser.main(["convert", str(tmp_path / "a.dat"), str(tmp_path / "none" / "b.log")]) == 1
-    assert "No such file" in capsys.readouterr().err
+    assert "No such file" in refused("convert", str(tmp_path / "a.dat"), str(tmp_path / "none" / "b.log"))
 
 
 def test_the_real_rover_logs(log_root: Path, tmp_path: Path) -> None:

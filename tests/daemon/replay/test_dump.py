@@ -1,7 +1,5 @@
 """Dumps of the flight recorder, replayed: they begin in the middle of a run and give the same poses to the last bit."""
 
-from __future__ import annotations
-
 import json
 import struct
 import tempfile

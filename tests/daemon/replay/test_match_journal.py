@@ -1,7 +1,5 @@
 """`lumiloop replay --journal`: matches as files, of foreign logs and of our own recordings, and wrong choices."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -3,8 +3,6 @@
 The same scans are replayed from the converted log, so that the two ways into the daemon are held against each other.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 from dataclasses import dataclass, replace

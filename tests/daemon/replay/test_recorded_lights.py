@@ -1,7 +1,5 @@
 """A recorded run with lights, replayed: blocks, survey and sample clock come back, poses the same to the last bit."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import json

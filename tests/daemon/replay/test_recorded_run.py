@@ -1,7 +1,5 @@
 """A recorded run, replayed: the whole daemon in virtual time, its recording, and the same poses to the last bit."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import json

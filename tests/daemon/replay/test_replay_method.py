@@ -1,7 +1,5 @@
 """`lumiloop replay --method`: the paper's method and pIC from the command line, on logs and on a lit recording."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

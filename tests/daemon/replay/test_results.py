@@ -1,7 +1,5 @@
 """Results as other tools read them."""
 
-from __future__ import annotations
-
 import errno
 import io
 import tracemalloc

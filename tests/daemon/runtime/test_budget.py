@@ -1,9 +1,9 @@
-"""Caps from measured cost: what gives way first, that map work never starves, that a spike is not a trend."""
-
-from __future__ import annotations
+"""The cycle's budget, and the levels of degradation where it does not suffice."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from daemon.runtime.budget import (
     COARSE,
@@ -23,6 +23,7 @@ from daemon.runtime.budget import (
     Spent,
     passes,
 )
+from daemon.runtime.degradation import LONGEST, MANY, PATIENCE, RECENT, Degradation
 from estimator.measurements import UNLIMITED, DegradationLevel, Limits
 from estimator.result import MatchResult, Reason, StepResult
 from estimator.scan_matching.scan_matcher import MatchSettings
@@ -257,3 +258,49 @@ def test_the_search_for_lamps_gets_a_millisecond_and_no_more_than_its_share() ->
 def test_scans_are_dense_where_the_matcher_takes_them_for_dense() -> None:
     told = MatchSettings()
     assert (told.dense, told.coarse) == (DENSE, COARSE)
+
+
+def test_down_at_once_and_up_one_rung_after_patience() -> None:
+    degradation = Degradation()
+    assert degradation.choose(DegradationLevel.NO_MAP) is DegradationLevel.NO_MAP
+    taken = [degradation.choose(DegradationLevel.FULL) for _ in range(2 * PATIENCE)]
+    assert taken == [DegradationLevel.NO_MAP] * (PATIENCE - 1) + [DegradationLevel.THINNED] * PATIENCE + [
+        DegradationLevel.FULL
+    ]
+
+
+def test_overruns_lead_down_and_the_patience_doubles_each_time() -> None:
+    degradation = Degradation()
+    waited = []
+    for _ in range(4):
+        for _ in range(MANY):
+            degradation.ended(overran=True, helps=True)
+        assert degradation.level is DegradationLevel.THINNED
+        count = 1
+        while degradation.choose(DegradationLevel.FULL) is not DegradationLevel.FULL:
+            count += 1
+        waited.append(count)
+    assert waited == sorted(waited)
+    assert waited[0] == 2 * PATIENCE
+    assert waited[-1] <= LONGEST
+
+
+def test_few_overruns_and_those_that_no_rung_helps_change_nothing() -> None:
+    degradation = Degradation()
+    for k in range(10 * RECENT):
+        degradation.ended(overran=k % 4 == 0, helps=True)
+        assert degradation.level is DegradationLevel.FULL
+    degradation = Degradation()
+    for _ in range(100):
+        degradation.ended(overran=True, helps=False)
+    assert degradation.level is DegradationLevel.FULL
+
+
+@given(st.lists(st.sampled_from(DegradationLevel), max_size=200))
+def test_never_better_than_what_fits(fits: list[DegradationLevel]) -> None:
+    degradation, before = Degradation(), DegradationLevel.FULL
+    for best in fits:
+        level = degradation.choose(best)
+        assert level >= min(best, before)
+        assert level >= before - 1
+        before = level

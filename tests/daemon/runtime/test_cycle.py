@@ -1,7 +1,5 @@
 """The cycle under virtual time: a pose that follows the room, when cycles start, what is kept, dropped and repeated."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Callable

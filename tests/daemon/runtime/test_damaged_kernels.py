@@ -1,7 +1,5 @@
 """Kernels whose files are damaged, locked or cannot be stored: every start comes to its end, and says what it did."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What waits for the next cycle: one scan, all motion, bounded whatever arrives; and the scan period learned."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """A lidar that repeats one scan while the robot moves: the cycle counts its scans and does not use them."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Histograms against numpy's quantiles; stages, rungs and stalls as they are published."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The stall watch names what ran: one of ours that works, one that waits, a thread, nothing."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import signal

@@ -1,7 +1,5 @@
 """Warm-up: beside the loop, with progress, under a lock, and no longer than it has to be."""
 
-from __future__ import annotations
-
 import asyncio
 import fcntl
 import gc

@@ -1,7 +1,5 @@
 """Background work: order, virtual and recorded answers, and jobs that fail."""
 
-from __future__ import annotations
-
 import logging
 import sys
 import threading

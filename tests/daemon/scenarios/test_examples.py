@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import threading
 from pathlib import Path
 
@@ -23,22 +22,17 @@ from hal.fake.lidar.scan_world import Room
 from hal.fake.transport.memory_host import FakeOpener
 from hal.port.port import Port
 from tests.daemon.support.light_room import Lit, plugged
+from tools.sim.ports import free_port
 
 EXAMPLES = sorted((Path(__file__).parents[3] / "systemd").glob("*.toml"))
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 def here(file: Path) -> Config:
     """The example as it is, on this machine's loopback and free ports."""
     settings = loader.load(file)
-    changes = ["bind=127.0.0.1", f"modbus.port={free_port(socket.SOCK_STREAM)}"]
+    changes = ["bind=127.0.0.1", f"modbus.port={free_port()}"]
     if settings.odometry.port:
-        changes.append(f"odometry.port={free_port(socket.SOCK_DGRAM)}")
+        changes.append(f"odometry.port={free_port()}")
     return loader.load(file, changes)
 
 

@@ -1,7 +1,5 @@
 """A photodiode at rest under a few coded lamps, as words of a fake converter on a fake bus; nothing finer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

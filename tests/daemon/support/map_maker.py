@@ -1,7 +1,5 @@
 """Maps for tests of the store: any shape and content, made of numbers and of nothing that was ever driven."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files that are no regular files, where a regular one is expected."""
 
-from __future__ import annotations
-
 import os
 import socket
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A rectangular room seen by an ideal lidar: raw scans for tests that need a pose that moves, and nothing finer."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

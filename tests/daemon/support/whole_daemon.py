@@ -1,7 +1,5 @@
 """Shared by the tests that run a whole daemon."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable
 

@@ -1,7 +1,5 @@
 """Files that are written whole, by root too, into a folder of another user."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A part of the program logs each defect once, whatever its text."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

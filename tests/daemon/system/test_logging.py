@@ -1,7 +1,5 @@
 """The daemon's log: fields to the journal's socket, lines where there is none, and never a wait."""
 
-from __future__ import annotations
-
 import io
 import logging
 import os

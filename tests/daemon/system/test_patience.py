@@ -1,7 +1,5 @@
 """A disk that does not answer costs what is on it, and is named."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

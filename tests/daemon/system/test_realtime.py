@@ -1,7 +1,5 @@
 """Real-time scheduling and locked memory, in processes of their own."""
 
-from __future__ import annotations
-
 import errno
 import os
 import resource

@@ -1,7 +1,5 @@
 """Files that a start reads: anything in their place, and reads that fail once or for ever."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tracebacks: one for an error, however often a client provokes it, whatever library reports it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import errno

@@ -1,7 +1,5 @@
 """Which software a recording was made with, where that is not what runs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Calibration finds what was put in, says how well it knows it, and says what the drive cannot tell."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

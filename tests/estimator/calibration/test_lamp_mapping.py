@@ -1,7 +1,5 @@
 """Lamps are placed from a drive, told apart where codes are used again, and doubts are said."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

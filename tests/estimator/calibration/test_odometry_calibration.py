@@ -1,7 +1,5 @@
 """Wheel scale, track and laser mount come out of a drive with honest sigmas, and what was not driven is not told."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The search for further lamps: with a small part of the effort where there is none, with all of it where there is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The tabulated pulse against the simulator's exact one, and the learning of a low-pass that is off."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What is remembered of lamps, and what a slice of search may cost."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

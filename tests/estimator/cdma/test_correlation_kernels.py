@@ -1,7 +1,5 @@
 """Each compiled loop against a slow twin that says the same in other words."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,6 +1,7 @@
-"""The data layer against the simulator's own encoder, damaged bits, wrong codes, inverted receivers."""
+"""Data frames of lamps: coded, accumulated and decoded."""
 
-from __future__ import annotations
+import copy
+import pickle
 
 import numpy as np
 import pytest
@@ -127,3 +128,17 @@ def test_a_forgotten_slot_knows_nothing() -> None:
     rings.forget(2)
     assert not rings.frames(np.array([2]), np.array([77]), np.array([10_000]))
     assert rings.before(np.array([2]), np.array([3]))[1] == 0.0
+
+
+def test_what_was_kept_goes_on_as_the_original() -> None:
+    rings = BitRings(3)
+    slots, period = np.array([0, 2]), np.array([5, 40])
+    soft, variance = np.array([[1.0, -2.0], [0.5, 3.0]]), np.array([[0.1, 0.2], [0.1, np.inf]])
+    rings.add(slots, period, soft, variance)
+    restored = [pickle.loads(pickle.dumps(rings)), copy.deepcopy(rings)]
+    for one in (rings, *restored):
+        one.add(slots, period + 1, soft, variance)
+    for one in restored:
+        for at in (period, period + 1):
+            np.testing.assert_array_equal(one.before(slots, at), rings.before(slots, at))
+    assert rings.before(slots, period + 1)[0].any()

@@ -1,7 +1,5 @@
 """The whole decoder in front of a simulated ceiling."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

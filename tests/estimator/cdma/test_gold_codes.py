@@ -1,7 +1,5 @@
 """Gold codes: built with shift registers here, from a finite field in the simulator, and both the same."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

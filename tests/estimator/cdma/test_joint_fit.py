@@ -1,7 +1,5 @@
 """The joint fit: unbiased, with honest variances, and it finds phases, lag and clock that it is not told."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

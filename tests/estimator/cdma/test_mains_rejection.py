@@ -1,7 +1,5 @@
 """Mains flicker: whatever its frequency and shape, nothing of it is left; a torn block moves the tracker little."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

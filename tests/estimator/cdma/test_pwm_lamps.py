@@ -1,7 +1,5 @@
 """PWM-dimmed lamps among coded ones: no lamp is lost, no code is invented, and the dimmed lamp is named."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Pauses of the bus at the same samples of every block: learned and corrected, or flagged with honest variances."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """False loops are voted out at the settings that the map is made with: real ones, random ones, a mirrored room."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Cells from elsewhere: walls as lines, free space as seen from all over the floor, and localising in them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is kept of the keyframes: some of each place, however often the robot comes by."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

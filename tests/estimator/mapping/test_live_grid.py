@@ -1,7 +1,5 @@
 """The map as tiles: only what is new or has moved is drawn again, what was moved in the room is forgotten."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Loops: keyframes whose odometry drifts, in a room whose truth is known; jobs are run where they are asked for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Constraints of the submap graph: what is joined, taken out and kept."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The conditions of Sect. 4.3: each judges one thing, and light tells places apart that look the same."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

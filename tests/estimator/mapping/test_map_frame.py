@@ -1,7 +1,5 @@
 """How surely a map lies in the survey's frame at one of its places."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A map taken from a state, and a state made from it: the same map, whatever either does afterwards."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

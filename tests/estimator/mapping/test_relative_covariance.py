@@ -1,7 +1,5 @@
 """How surely two places are known relative to each other: by the way, and by the surest path through the graph."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

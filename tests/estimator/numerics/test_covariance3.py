@@ -1,7 +1,5 @@
 """The kernels of the pose's covariance against the same in numpy, product by product."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Kernels are kept by what shaped them; those of earlier versions are removed, those that may be running are not."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files of compiled kernels after a power cut, a failing disk or a stranger: compiled again, once, and never fatal."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Kernels that were compiled before: loaded without what only compiling needs, and still good for who is compiled."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Which kernels Python calls, and that a start does without the machine code of the others."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 Each way has its own directory of compiled kernels, so the first run compiles for about a minute.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Planar transforms: group laws, against matrices."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

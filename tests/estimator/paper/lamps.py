@@ -1,7 +1,5 @@
 """A grid of level lamps, and epochs of what a level receiver gets of them by Eq. 1 and 2: exact, no floor, no noise."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 

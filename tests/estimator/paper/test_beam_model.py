@@ -1,7 +1,5 @@
 """The beam model: a proper density, expected ranges beside a slow twin, and what separates true from false poses."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The paper's light filter: its prediction, update and start against slow twins, and when it gives no pose."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Methods by name: the door, a lit drive by the paper's method, its pause, its map step, and pIC without light."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Eq. 13-15 on the group of rigid motions: combination, weights, what T1 is, and that nothing is counted twice."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The shortest-link mechanism on epochs: which links are used, which are paused, and what place comes of them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

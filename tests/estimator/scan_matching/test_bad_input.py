@@ -1,7 +1,5 @@
 """Bad input to the matcher and to the whole step: a reason, never an exception, never a confident wrong pose."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

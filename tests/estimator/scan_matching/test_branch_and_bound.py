@@ -1,7 +1,5 @@
 """Search for a place without any idea of it: exact against trying everything, ambiguity in plain sight."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

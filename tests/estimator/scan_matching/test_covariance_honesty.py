@@ -1,7 +1,5 @@
 """What matches miss by and what they say of it: a few dozen trials each time, a thousand in the slow run."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From beams to points: the filter, the mount, and the motion during the scan."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The distance axis gives the nearest neighbour that comparing every pair gives, however many sectors it has."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The paper's fused axis (Eq. 10-12): order, light points, quality filter, and the nearest neighbour it gives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """The matching kernels: pairs, sums, what may be trusted; accuracy and honesty in rooms whose truth is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Line elements: where surfaces are, which way they face, and how well that is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

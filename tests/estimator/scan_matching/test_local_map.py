@@ -1,7 +1,5 @@
 """The local map on simulated drives: bounded, rid of people, not led by glass; keyframes; what is learned of beams."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ sums made right again, so that damage reaches what lies behind them. ``feeder()`
 anything but the parser's own refusal comes out, and where sound bytes after it are not understood.
 """
 
-from __future__ import annotations
-
 import atexit
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """What a converter and a remote bus send: blocks of words, and the frames that carry them."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable

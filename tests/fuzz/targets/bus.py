@@ -1,7 +1,5 @@
 """Both ends of a remote bus: a client under any server's bytes, a server under any client's."""
 
-from __future__ import annotations
-
 import asyncio
 import atexit
 import math

@@ -1,7 +1,5 @@
 """Logs that are to be replayed: CARMEN's text, captures of a serial line, our own recordings."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable

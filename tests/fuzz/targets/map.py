@@ -1,7 +1,5 @@
 """Map files: the container, its tables, and the robot that starts with what they hold."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What Modbus clients send: datagrams, streams cut anywhere, and the bytes of a serial line."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import weakref

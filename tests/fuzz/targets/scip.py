@@ -1,7 +1,5 @@
 """What a lidar sends: the splitter, the codec and the listener."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

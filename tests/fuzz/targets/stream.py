@@ -1,7 +1,5 @@
 """What the taps of the local stream ask for."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import random

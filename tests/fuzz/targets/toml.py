@@ -1,7 +1,5 @@
 """Texts that people write: the configuration, a survey of the lamps, a map server's description."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from daemon.config import loader, survey_loader

@@ -1,7 +1,5 @@
 """Datagrams: what brings odometry and gyro readings, what asks for poses, and what a client of the pose reads."""
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """A model of the kernel's i2c-dev behind smbus2: ``open`` and ``ioctl`` replaced, a simulated bus instead of a wire."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import os

@@ -1,7 +1,5 @@
 """Helpers of the tests of the remote bus: a served fake converter, and a server under the test's control."""
 
-from __future__ import annotations
-
 import socket
 import threading
 import time

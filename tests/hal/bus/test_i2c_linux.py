@@ -1,7 +1,5 @@
 """``/dev/i2c-N`` through smbus2, with the kernel's ioctl replaced by a model of it."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import os

@@ -1,7 +1,5 @@
 """The client of a remote bus, over real unix and TCP sockets."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import os

@@ -1,7 +1,5 @@
 """The remote bus among strangers: servers that lie, clients without end, addresses open to everyone."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import random

@@ -1,7 +1,5 @@
 """The bus server: several clients, malformed requests, addresses, the command."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import os

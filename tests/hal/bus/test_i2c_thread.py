@@ -1,7 +1,5 @@
 """A thread of its own for a blocking bus."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import threading

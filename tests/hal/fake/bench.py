@@ -3,12 +3,10 @@
 The reader is a third implementation of the protocol, strict and slow; it shares nothing with the encoder or the driver.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,6 +19,7 @@ from hal.fake.lidar.rotor import Rotor
 from hal.fake.lidar.scan import FakeScan, ScanSource
 from hal.fake.transport.memory_host import FakeOpener
 from hal.port.port import Port
+from tests.hal.driven import played
 
 T = TypeVar("T")
 
@@ -202,3 +201,8 @@ def virtual(
             device.close()
 
     return run_virtual(main())
+
+
+def talking(*what: Any, **how: Any) -> Callable[..., Callable[..., None]]:
+    """A coroutine test with one device, ``talk``, in virtual time; arguments as of :func:`virtual`."""
+    return played(lambda scene: virtual(scene, *what, **how), "talk")

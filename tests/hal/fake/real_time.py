@@ -1,16 +1,15 @@
 """Helpers of real-time tests of the fake lidar: a pty with its host, and waiting with slack for a busy computer."""
 
-from __future__ import annotations
-
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import serial
 
 from hal.fake.lidar.device import FakeHokuyo
-from hal.fake.lidar.models import UTM_30LX, LidarModel
+from hal.fake.lidar.models import UTM_30LX
 from hal.fake.transport.pty_server import PtyServer
 from tests.hal.fake.bench import ramp
 
@@ -25,17 +24,15 @@ async def until(true: Callable[[], object], seconds: float = 5.0) -> None:
         await asyncio.sleep(0.01)
 
 
-def on_pty(scene: Callable[[FakeHokuyo, PtyServer], Awaitable[None]], link: Path, model: LidarModel = UTM_30LX) -> None:
-    async def main() -> None:
-        device = FakeHokuyo(model, ramp(model))
-        server = PtyServer(device, link)
-        try:
-            await scene(device, server)
-        finally:
-            server.close()
-            device.close()
-
-    asyncio.run(main())
+@asynccontextmanager
+async def on_pty(link: Path) -> AsyncIterator[tuple[FakeHokuyo, PtyServer]]:
+    device = FakeHokuyo(UTM_30LX, ramp(UTM_30LX))
+    server = PtyServer(device, link)
+    try:
+        yield device, server
+    finally:
+        server.close()
+        device.close()
 
 
 def opened(path: str, baud: int = 19200) -> serial.Serial:

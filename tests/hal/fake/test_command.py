@@ -1,7 +1,5 @@
 """The command that serves the fake lidar, and its control socket."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import subprocess

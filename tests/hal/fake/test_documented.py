@@ -1,7 +1,5 @@
 """The vocabulary in the documentation is the vocabulary."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The fake motor controller: its datagrams are those of docs/udp.md, and each order does what its word says."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 

@@ -1,10 +1,10 @@
 """A bench for driver tests: the fake sensor in virtual time, or the real one named by ``--lidar`` in real time."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from hal.hokuyo.driver import HokuyoDriver
 from hal.lidar import RawScan
 from hal.port.opening import open_port
 from hal.port.port import PortOpener
+from tests.hal.driven import played, running
 
 PORT = "/dev/ttyACM7"  # a name that stands for USB; nothing is opened under it
 
@@ -85,33 +86,13 @@ class Bench:
             await asyncio.sleep(0.005)
         return self.scans[before:]
 
-    def running(self, driver: HokuyoDriver) -> Running:
-        return Running(driver, self.scans.append)
+    def running(self, driver: HokuyoDriver) -> AbstractAsyncContextManager[asyncio.Task[None]]:
+        return running(driver.run(self.scans.append))
 
     def order(self, toml: str) -> None:
         """Put fault orders in force."""
         assert self.faults is not None
         self.faults.load(toml)
-
-
-class Running:
-    """A driver that runs inside an ``async with``, cancelled at its end."""
-
-    def __init__(self, driver: HokuyoDriver, on_scan: Callable[[RawScan], None]) -> None:
-        self._driver, self._on_scan = driver, on_scan
-
-    async def __aenter__(self) -> asyncio.Task[None]:
-        self.task = asyncio.create_task(self._driver.run(self._on_scan))
-        return self.task
-
-    async def __aexit__(self, *_: object) -> None:
-        assert not self.task.done(), "the driver must never end by itself"
-        self.task.cancel()
-        try:
-            await self.task
-        except asyncio.CancelledError:
-            return
-        raise AssertionError("the driver swallowed its cancellation")
 
 
 Body = Callable[[Bench], Awaitable[None]]
@@ -132,6 +113,11 @@ def on_fake(body: Body, model: LidarModel = UTM_30LX, unit: Unit | None = None, 
         fake.close()
 
     run_virtual(main(), start=1000.0)
+
+
+def faked(*where: Any, **how: Any) -> Callable[..., Callable[..., None]]:
+    """A coroutine test on the fake sensor, in virtual time; arguments as of :func:`on_fake`."""
+    return played(lambda body: on_fake(body, *where, **how))
 
 
 def on_bench(body: Body, lidar: str, model: LidarModel = UTM_30LX, unit: Unit | None = None) -> None:

@@ -3,8 +3,6 @@
 It shares nothing with the driver's codec or with the fake sensor, so that none can hide another's error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 

@@ -1,7 +1,5 @@
 """The driver over a kernel pty and a loopback socket, against the wall clock with fourfold slack."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Awaitable, Callable

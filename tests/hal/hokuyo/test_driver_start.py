@@ -1,7 +1,5 @@
 """Sensors that are not ready, deny what is not needed, or report themselves in unusual words: scans all the same."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 
@@ -10,7 +8,7 @@ import pytest
 
 from hal.fake.lidar.models import MODELS, UST_10LX, UTM_30LX, LidarModel, Unit
 from hal.hokuyo.sensor_errors import NotReady, StartingUp
-from tests.hal.hokuyo.bench import Bench, error_of, on_fake
+from tests.hal.hokuyo.bench import Bench, error_of, faked, on_fake
 
 UTM_EW = replace(UTM_30LX, modl="UTM-30LX-EW[Hokuyo]", prod="UTM-30LX-EW", link="ethernet")
 
@@ -59,37 +57,34 @@ def test_a_sensor_that_is_not_ready_for_a_minute_is_awaited(model: LidarModel, s
 
 
 @pytest.mark.parametrize("status", ["0M", "0E", "10", "0L"])
-def test_reboots_at_growing_distances_end_when_the_sensor_needs_longer(status: str) -> None:
+@faked(UST_10LX)
+async def test_reboots_at_growing_distances_end_when_the_sensor_needs_longer(bench: Bench, status: str) -> None:
     """Each reboot begins the time anew that the sensor needs."""
     needed = 150.0
-
-    async def body(bench: Bench) -> None:
-        reboots = times_of(bench, "RB")
-        bench.order(not_ready(needed, status))
-        took = await first_scan(bench, 2000.0)
-        times = np.array(reboots[1::2])  # the second of each pair takes effect
-        assert len(times) >= 1
-        gaps = np.diff(times)
-        assert (gaps[1:] > 1.8 * gaps[:-1]).all(), gaps
-        assert took < times[-1] + 1.0 + UST_10LX.boot_s + needed + 5.0
-
-    on_fake(body, UST_10LX)
+    reboots = times_of(bench, "RB")
+    bench.order(not_ready(needed, status))
+    took = await first_scan(bench, 2000.0)
+    times = np.array(reboots[1::2])  # the second of each pair takes effect
+    assert len(times) >= 1
+    gaps = np.diff(times)
+    assert (gaps[1:] > 1.8 * gaps[:-1]).all(), gaps
+    assert took < times[-1] + 1.0 + UST_10LX.boot_s + needed + 5.0
 
 
 @pytest.mark.parametrize(("status", "mode"), [("0M", "001 Booting"), ("10", "Starting up"), ("0E", "006 Waking up")])
-def test_a_sensor_that_reports_its_start_is_never_rebooted_nor_reset(status: str, mode: str) -> None:
-    async def body(bench: Bench) -> None:
-        words = [times_of(bench, word) for word in ("RB", "RS", "RT")]
-        bench.order(not_ready(1800.0, status, mode))
-        driver = bench.driver()
-        async with bench.running(driver):
-            await asyncio.sleep(1700.0)
-            assert isinstance(error_of(driver), StartingUp)
-            assert f"the sensor reports: {mode}" in str(error_of(driver))
-            await bench.more(1, 105.0, driver)
-        assert words == [[], [], []]
-
-    on_fake(body, UTM_EW)
+@faked(UTM_EW)
+async def test_a_sensor_that_reports_its_start_is_never_rebooted_nor_reset(
+    bench: Bench, status: str, mode: str
+) -> None:
+    words = [times_of(bench, word) for word in ("RB", "RS", "RT")]
+    bench.order(not_ready(1800.0, status, mode))
+    driver = bench.driver()
+    async with bench.running(driver):
+        await asyncio.sleep(1700.0)
+        assert isinstance(error_of(driver), StartingUp)
+        assert f"the sensor reports: {mode}" in str(error_of(driver))
+        await bench.more(1, 105.0, driver)
+    assert words == [[], [], []]
 
 
 @pytest.mark.parametrize("model", [UTM_30LX, UST_10LX], ids=["2.0", "2.2"])
@@ -149,16 +144,14 @@ def test_nothing_but_pp_is_needed_to_measure(model: LidarModel, order: str, with
     on_fake(body, model)
 
 
-def test_a_sensor_without_a_readable_serial_number_is_not_the_one_that_is_named() -> None:
-    async def body(bench: Bench) -> None:
-        bench.order('[[fault]]\nwhat = "denied"')
-        driver = bench.driver(serial="H0706400")
-        async with bench.running(driver):
-            await asyncio.sleep(3.0)
-            assert "gives no readable serial number, not H0706400" in str(error_of(driver))
-            assert bench.scans == []
-
-    on_fake(body)
+@faked()
+async def test_a_sensor_without_a_readable_serial_number_is_not_the_one_that_is_named(bench: Bench) -> None:
+    bench.order('[[fault]]\nwhat = "denied"')
+    driver = bench.driver(serial="H0706400")
+    async with bench.running(driver):
+        await asyncio.sleep(3.0)
+        assert "gives no readable serial number, not H0706400" in str(error_of(driver))
+        assert bench.scans == []
 
 
 @pytest.mark.parametrize(
@@ -176,38 +169,36 @@ def test_a_sensor_without_a_readable_serial_number_is_not_the_one_that_is_named(
         ("MODL", "H\xf6kuy\xf6-7", {"model": "H?kuy?-7"}),
     ],
 )
-def test_parameters_in_other_words_are_read(key: str, value: str, expected: dict[str, object]) -> None:
-    async def body(bench: Bench) -> None:
-        bench.order(f'[[fault]]\nwhat = "parameter"\nkey = "{key}"\nvalue = "{value}"')
-        driver = bench.driver()
-        await bench.deliver(driver, 30, 3.0)
-        assert {name: getattr(driver.geometry, name) for name in expected} == expected
-
-    on_fake(body)
+@faked()
+async def test_parameters_in_other_words_are_read(
+    bench: Bench, key: str, value: str, expected: dict[str, object]
+) -> None:
+    bench.order(f'[[fault]]\nwhat = "parameter"\nkey = "{key}"\nvalue = "{value}"')
+    driver = bench.driver()
+    await bench.deliver(driver, 30, 3.0)
+    assert {name: getattr(driver.geometry, name) for name in expected} == expected
 
 
 @pytest.mark.parametrize("dmin", [0, 1, 20, 100])
 @pytest.mark.parametrize("dmax", [30000, 65533, 100000, 262143])
 @pytest.mark.parametrize("value", [0, 1, 19, 65533, 65535, 262143])
-def test_codes_are_no_distances_whatever_the_sensor_states(dmin: int, dmax: int, value: int) -> None:
-    async def body(bench: Bench) -> None:
-        bench.order(f'[[fault]]\nwhat = "parameter"\nkey = "DMIN"\nvalue = "{dmin}"')
-        bench.order(f'[[fault]]\nwhat = "dmax"\nvalue = {dmax}')
-        bench.order(f'[[fault]]\nwhat = "codes"\nvalue = {value}\nbeams = 1.0')
-        (scan, *_) = await bench.deliver(bench.driver(), 1, 3.0)
-        assert (scan.ranges == 0).all()
-        assert (scan.code == value).all()
+@faked(replace(UTM_30LX, modl="NEW-50LX", prod="NEW-50LX"))
+async def test_codes_are_no_distances_whatever_the_sensor_states(
+    bench: Bench, dmin: int, dmax: int, value: int
+) -> None:
+    bench.order(f'[[fault]]\nwhat = "parameter"\nkey = "DMIN"\nvalue = "{dmin}"')
+    bench.order(f'[[fault]]\nwhat = "dmax"\nvalue = {dmax}')
+    bench.order(f'[[fault]]\nwhat = "codes"\nvalue = {value}\nbeams = 1.0')
+    (scan, *_) = await bench.deliver(bench.driver(), 1, 3.0)
+    assert (scan.ranges == 0).all()
+    assert (scan.code == value).all()
 
-    on_fake(body, replace(UTM_30LX, modl="NEW-50LX", prod="NEW-50LX"))
 
-
-def test_ranges_beyond_the_codes_are_distances_where_the_sensor_has_them() -> None:
-    async def body(bench: Bench) -> None:
-        bench.order('[[fault]]\nwhat = "codes"\nvalue = 70000\nbeams = 1.0')
-        (scan, *_) = await bench.deliver(bench.driver(), 1, 3.0)
-        assert (scan.ranges == 70000).all()
-
-    on_fake(body, MODELS["UXM-30LX-E"])
+@faked(MODELS["UXM-30LX-E"])
+async def test_ranges_beyond_the_codes_are_distances_where_the_sensor_has_them(bench: Bench) -> None:
+    bench.order('[[fault]]\nwhat = "codes"\nvalue = 70000\nbeams = 1.0')
+    (scan, *_) = await bench.deliver(bench.driver(), 1, 3.0)
+    assert (scan.ranges == 70000).all()
 
 
 TROUBLE = "Trouble!! Error No. =[00->33]"
@@ -242,20 +233,17 @@ def test_the_sensors_own_report_is_part_of_the_fault(model: LidarModel, order: s
     on_fake(body, model)
 
 
-def test_the_report_of_the_error_state_is_part_of_the_fault() -> None:
+@faked(UST_10LX)
+async def test_the_report_of_the_error_state_is_part_of_the_fault(bench: Bench) -> None:
     """0L at the start: II is answered, RB ends it."""
-
-    async def body(bench: Bench) -> None:
-        await bench.say(b"MD0100020001000\n")
-        bench.order('[[fault]]\nwhat = "error"\ncode = 70')
-        driver = bench.driver()
-        async with bench.running(driver):
-            await asyncio.sleep(1.0)
-            assert "0L" in str(error_of(driver))
-            assert "the sensor reports: Trouble!! Error No. =[00->70]" in str(error_of(driver))
-            await bench.more(5, 10.0, driver)
-
-    on_fake(body, UST_10LX)
+    await bench.say(b"MD0100020001000\n")
+    bench.order('[[fault]]\nwhat = "error"\ncode = 70')
+    driver = bench.driver()
+    async with bench.running(driver):
+        await asyncio.sleep(1.0)
+        assert "0L" in str(error_of(driver))
+        assert "the sensor reports: Trouble!! Error No. =[00->70]" in str(error_of(driver))
+        await bench.more(5, 10.0, driver)
 
 
 @pytest.mark.parametrize(("cluster", "baud", "beams"), [(2, 115200, 341), (3, 57600, 227)])

@@ -1,7 +1,5 @@
 """The driver starts from any state a sensor can be in. Bodies without faults run on a real sensor too (--lidar)."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 
@@ -13,7 +11,7 @@ from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import MODELS, UST_10LX, UTM_30LX, LidarModel, Unit
 from hal.lidar import VALID, Link
 from hal.port.port import Port
-from tests.hal.hokuyo.bench import Bench, on_bench, on_fake
+from tests.hal.hokuyo.bench import Bench, faked, on_bench, on_fake
 
 BY_HAND = {
     "idle": (),
@@ -130,78 +128,68 @@ def test_rs232_from_any_rate(rate: int) -> None:
     on_fake(body, MODELS["URG-04LX"], Unit(baud=rate), device="/dev/ttyUSB7")
 
 
-def test_rs232_still_streaming_at_a_slow_rate() -> None:
-    async def body(bench: Bench) -> None:
-        await bench.say(b"MD0044072501000\n", pause=3.0)
-        await bench.deliver(bench.driver(), 10, within=30.0)
-
-    on_fake(body, MODELS["URG-04LX"], Unit(baud=115200), device="/dev/ttyUSB7")
+@faked(MODELS["URG-04LX"], Unit(baud=115200), device="/dev/ttyUSB7")
+async def test_rs232_still_streaming_at_a_slow_rate(bench: Bench) -> None:
+    await bench.say(b"MD0044072501000\n", pause=3.0)
+    await bench.deliver(bench.driver(), 10, within=30.0)
 
 
 @pytest.mark.parametrize(("baud", "beams", "period"), [(115200, 341, 0.1002), (57600, 227, 0.2004), (19200, 227, 0.4)])
-def test_a_slow_line_gets_what_it_can_carry(baud: int, beams: int, period: float) -> None:
-    async def body(bench: Bench) -> None:
-        driver = bench.driver(baud=baud)
-        scans = await bench.deliver(driver, 20, within=40.0)
-        assert len(scans[0].ranges) == beams
-        assert driver.status.missed == 0
-        assert np.allclose(np.diff([scan.t_mono for scan in scans[5:]]), period, rtol=0.01)
-        assert bench.fake is not None
-        assert bench.fake.counts.lost_in_sensor == 0
-
-    on_fake(body, MODELS["URG-04LX"], device="/dev/ttyUSB7")
+@faked(MODELS["URG-04LX"], device="/dev/ttyUSB7")
+async def test_a_slow_line_gets_what_it_can_carry(bench: Bench, baud: int, beams: int, period: float) -> None:
+    driver = bench.driver(baud=baud)
+    scans = await bench.deliver(driver, 20, within=40.0)
+    assert len(scans[0].ranges) == beams
+    assert driver.status.missed == 0
+    assert np.allclose(np.diff([scan.t_mono for scan in scans[5:]]), period, rtol=0.01)
+    assert bench.fake is not None
+    assert bench.fake.counts.lost_in_sensor == 0
 
 
-def test_an_adapter_that_cannot_do_the_rate_wanted() -> None:
+@faked(MODELS["URG-04LX"], device="/dev/ttyUSB7")
+async def test_an_adapter_that_cannot_do_the_rate_wanted(bench: Bench) -> None:
     """The next lower rate both sides can do, and clusters that fit it."""
+    real = bench.opener
 
-    async def body(bench: Bench) -> None:
-        real = bench.opener
+    async def opener(device: str, baud: int) -> Port:
+        port = await real(device, baud)
+        plain = port.set_baud
 
-        async def opener(device: str, baud: int) -> Port:
-            port = await real(device, baud)
-            plain = port.set_baud
+        def limited(rate: int) -> None:
+            if rate > 115200:
+                raise DeviceRefused(device, f"cannot do {rate} bit/s", "choose another line rate")
+            plain(rate)
 
-            def limited(rate: int) -> None:
-                if rate > 115200:
-                    raise DeviceRefused(device, f"cannot do {rate} bit/s", "choose another line rate")
-                plain(rate)
+        port.set_baud = limited  # type: ignore[method-assign]  # an adapter with limits
+        return port
 
-            port.set_baud = limited  # type: ignore[method-assign]  # an adapter with limits
-            return port
-
-        bench.opener = opener
-        driver = bench.driver()
-        scans = await bench.deliver(driver, 20, within=20.0)
-        assert driver.status.extra["baud"] == "115200"
-        assert len(scans[0].ranges) == 341
-        assert driver.status.missed == 0
-
-    on_fake(body, MODELS["URG-04LX"], device="/dev/ttyUSB7")
+    bench.opener = opener
+    driver = bench.driver()
+    scans = await bench.deliver(driver, 20, within=20.0)
+    assert driver.status.extra["baud"] == "115200"
+    assert len(scans[0].ranges) == 341
+    assert driver.status.missed == 0
 
 
-def test_a_rate_at_which_the_sensor_is_lost_is_not_tried_again() -> None:
+@faked(MODELS["URG-04LX"], device="/dev/ttyUSB7")
+async def test_a_rate_at_which_the_sensor_is_lost_is_not_tried_again(bench: Bench) -> None:
     """The cable is too bad for 250 kbit/s: the sensor accepts and cannot be understood there."""
+    assert bench.fake is not None
+    fake, tries = bench.fake, 0
+    send = fake.receive
 
-    async def body(bench: Bench) -> None:
-        assert bench.fake is not None
-        fake, tries = bench.fake, 0
-        send = fake.receive
+    def receive(data: bytes) -> None:
+        nonlocal tries
+        if b"SS250000" in data:
+            tries += 1
+        if fake.baud == 250000:
+            if b"QT" not in data:
+                return
+            data = b"RS\n" + data  # stands for a person who power-cycles it
+        send(data)
 
-        def receive(data: bytes) -> None:
-            nonlocal tries
-            if b"SS250000" in data:
-                tries += 1
-            if fake.baud == 250000:
-                if b"QT" not in data:
-                    return
-                data = b"RS\n" + data  # stands for a person who power-cycles it
-            send(data)
-
-        fake.receive = receive  # type: ignore[method-assign]  # a bad cable
-        driver = bench.driver()
-        await bench.deliver(driver, 20, within=60.0)
-        assert tries == 1
-        assert driver.status.extra["baud"] == "115200"
-
-    on_fake(body, MODELS["URG-04LX"], device="/dev/ttyUSB7")
+    fake.receive = receive  # type: ignore[method-assign]  # a bad cable
+    driver = bench.driver()
+    await bench.deliver(driver, 20, within=60.0)
+    assert tries == 1
+    assert driver.status.extra["baud"] == "115200"

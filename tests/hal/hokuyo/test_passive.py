@@ -1,7 +1,5 @@
 """The listener: geometry from the bytes or given, streams by their echoes, damage counted; a real capture decodes."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from pathlib import Path

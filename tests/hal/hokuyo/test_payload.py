@@ -1,7 +1,5 @@
 """Scan payloads: published examples byte for byte, every form by property, every rule of damage."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,13 +1,11 @@
 """Probing: every port says who is there or why not, and sensors are left as they should be."""
 
-from __future__ import annotations
-
 import asyncio
 from pathlib import Path
 
 import pytest
 
-from hal.clock import LoopClock, run_virtual
+from hal.clock import LoopClock
 from hal.errors import DeviceFault, DeviceMissing
 from hal.fake.lidar.device import FakeHokuyo
 from hal.fake.lidar.dialect_grid import State
@@ -19,29 +17,27 @@ from hal.port.port import Port, memory_pair
 from tests.hal.hokuyo.bench import Scene
 
 
-def test_who_is_where() -> None:
-    async def body() -> list[Finding]:
-        plugs = FakeOpener(LoopClock(asyncio.get_running_loop()))
-        utm = FakeHokuyo(UTM_30LX, Scene(UTM_30LX), unit=Unit(serial="H1"))
-        urg = FakeHokuyo(URG_04LX, Scene(URG_04LX), unit=Unit(serial="H2", baud=115200))
-        mute = FakeHokuyo(UTM_30LX, Scene(UTM_30LX))
-        plugs.plug("/dev/ttyACM0", utm)
-        plugs.plug("/dev/ttyUSB0", urg)
-        plugs.plug("/dev/ttyACM1", mute)
-        mute.receive = lambda data: None  # type: ignore[method-assign]  # something else than a lidar
-        port = await plugs("/dev/ttyACM0", 0)
-        port.write(b"MD0000108001000\n")
-        await asyncio.sleep(0.5)
-        port.close()
-        await asyncio.sleep(0.1)
-        assert utm.state is State.MULTI
-        found = await probe(plugs, ["/dev/ttyACM0", "/dev/ttyUSB0", "/dev/ttyACM1", "/dev/ttyACM9"])
-        assert utm.state is State.IDLE
-        again = await plugs("/dev/ttyACM0", 0)  # it was closed
-        again.close()
-        return found
-
-    a, b, c, d = run_virtual(body())
+@pytest.mark.virtual
+async def test_who_is_where() -> None:
+    plugs = FakeOpener(LoopClock(asyncio.get_running_loop()))
+    utm = FakeHokuyo(UTM_30LX, Scene(UTM_30LX), unit=Unit(serial="H1"))
+    urg = FakeHokuyo(URG_04LX, Scene(URG_04LX), unit=Unit(serial="H2", baud=115200))
+    mute = FakeHokuyo(UTM_30LX, Scene(UTM_30LX))
+    plugs.plug("/dev/ttyACM0", utm)
+    plugs.plug("/dev/ttyUSB0", urg)
+    plugs.plug("/dev/ttyACM1", mute)
+    mute.receive = lambda data: None  # type: ignore[method-assign]  # something else than a lidar
+    port = await plugs("/dev/ttyACM0", 0)
+    port.write(b"MD0000108001000\n")
+    await asyncio.sleep(0.5)
+    port.close()
+    await asyncio.sleep(0.1)
+    assert utm.state is State.MULTI
+    found = await probe(plugs, ["/dev/ttyACM0", "/dev/ttyUSB0", "/dev/ttyACM1", "/dev/ttyACM9"])
+    assert utm.state is State.IDLE
+    again = await plugs("/dev/ttyACM0", 0)  # it was closed
+    again.close()
+    a, b, c, d = found
     assert a.geometry is not None
     assert (a.geometry.serial, a.geometry.amax, a.baud) == ("H1", 1080, 0)
     assert "UTM-30LX" in str(a)
@@ -54,20 +50,18 @@ def test_who_is_where() -> None:
     assert isinstance(d.error, DeviceMissing)
 
 
-def test_a_server_of_something_else_that_hangs_up_is_shown_by_its_first_words() -> None:
-    async def body() -> tuple[Finding, Finding]:
-        clock = LoopClock(asyncio.get_running_loop())
+@pytest.mark.virtual
+async def test_a_server_of_something_else_that_hangs_up_is_shown_by_its_first_words() -> None:
+    clock = LoopClock(asyncio.get_running_loop())
 
-        async def serves(device: str, baud: int) -> Port:
-            ours, its = memory_pair(clock, device)
-            its.start(lambda data, _t: its.close(), lambda error: None)
-            if "ssh" in device:
-                its.write(b"SSH-2.0-OpenSSH_9.2p1 Debian\r\n")
-            return ours
+    async def serves(device: str, baud: int) -> Port:
+        ours, its = memory_pair(clock, device)
+        its.start(lambda data, _t: its.close(), lambda error: None)
+        if "ssh" in device:
+            its.write(b"SSH-2.0-OpenSSH_9.2p1 Debian\r\n")
+        return ours
 
-        return await identify_at(serves, "tcp://ssh:22"), await identify_at(serves, "tcp://mute:22")
-
-    banner, mute = run_virtual(body())
+    banner, mute = (await identify_at(serves, "tcp://ssh:22"), await identify_at(serves, "tcp://mute:22"))
     assert "only unreadable bytes arrive" in str(banner)
     assert "'SSH-2.0-OpenSSH_9.2p': name the address and port of the lidar" in str(banner)
     assert isinstance(mute.error, DeviceMissing)
@@ -138,17 +132,14 @@ def test_a_rate_that_somebody_has_written_makes_a_line_of_what_is_not_known(devi
 
 
 @pytest.mark.parametrize("wrong", [0, 19200])
-def test_a_line_that_nothing_tells_to_be_one_is_found_with_its_rate(wrong: int) -> None:
+@pytest.mark.virtual
+async def test_a_line_that_nothing_tells_to_be_one_is_found_with_its_rate(wrong: int) -> None:
     """Also where the sensor talks at another rate than the one that was written."""
-
-    async def body() -> tuple[Finding, Finding]:
-        plugs = FakeOpener(LoopClock(asyncio.get_running_loop()))
-        plugs.plug("/dev/pts/7", FakeHokuyo(URG_04LX, Scene(URG_04LX), unit=Unit(serial="H2", baud=57600)))
-        unknown = await identify_at(plugs, "/dev/pts/7")
-        await asyncio.sleep(0.1)  # it is closed
-        return unknown, await identify_at(plugs, "/dev/pts/7", wrong or 57600)
-
-    unknown, found = run_virtual(body())
+    plugs = FakeOpener(LoopClock(asyncio.get_running_loop()))
+    plugs.plug("/dev/pts/7", FakeHokuyo(URG_04LX, Scene(URG_04LX), unit=Unit(serial="H2", baud=57600)))
+    unknown = await identify_at(plugs, "/dev/pts/7")
+    await asyncio.sleep(0.1)  # it is closed
+    unknown, found = (unknown, await identify_at(plugs, "/dev/pts/7", wrong or 57600))
     assert unknown.geometry is None
     assert found.geometry is not None
     assert found.baud == 57600

@@ -1,15 +1,18 @@
-"""The codec against byte-exact conversations, real and computed by hand, and against its own rules by property."""
+"""SCIP: lines, checksums and replies."""
 
-from __future__ import annotations
-
+import asyncio
 import itertools
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hal.clock import LoopClock
+from hal.errors import DeviceMissing
 from hal.hokuyo import scip
 from hal.hokuyo.scip import BadFrame, Flaw, FrameSplitter, parse_reply, parse_stamp, parse_text
+from hal.hokuyo.scip_line import Line
+from hal.port.port import MemoryPort, memory_pair
 from tests.hal.hokuyo import encoder
 
 URG_VV = (
@@ -203,3 +206,63 @@ def test_reset_half_way_through_does_not_join_old_and_new() -> None:
     splitter.feed(b"MD0044072501000\n99b\n0123")
     splitter.reset()
     assert splitter.feed(b"VV\n00P\n\n") == [b"VV\n00P"]
+
+
+def a_line() -> tuple[Line, MemoryPort, list[bytes]]:
+    """The line, the sensor's end of it, and what the sensor receives."""
+    ours, theirs = memory_pair(LoopClock(asyncio.get_running_loop()), "/dev/x")
+    heard: list[bytes] = []
+    theirs.start(lambda data, t: heard.append(data), lambda error: None)
+    return Line(ours), theirs, heard
+
+
+@pytest.mark.virtual
+async def test_a_question_is_flushed_before_and_answered_by_its_echo_alone() -> None:
+    line, sensor, heard = a_line()
+    others: list[bytes] = []
+    line.on_frame = lambda frame, t: others.append(frame)
+    loop = asyncio.get_running_loop()
+    loop.call_later(0.1, sensor.write, b"VV\n00P\n\nQT\n99b\n\nQT\n0")
+    loop.call_later(0.2, sensor.write, b"0P\n\nQT\n00P\n\n")
+    assert await line.exchange(scip.QT, 1.0) == b"QT\n00P"
+    assert heard == [b"\nQT\n"]
+    assert others == [b"VV\n00P", b"QT\n99b", b"QT\n00P"]  # a second answer to it is nobody's
+
+
+@pytest.mark.virtual
+async def test_no_answer_in_time() -> None:
+    line, sensor, _ = a_line()
+    with pytest.raises(TimeoutError):
+        await line.exchange(scip.VV, 0.5)
+    sensor.write(b"VV\n00P\n\n")  # too late: must not answer the next question
+    asyncio.get_running_loop().call_later(0.1, sensor.write, b"PP\n00P\n\n")
+    assert await line.exchange(scip.PP, 0.5) == b"PP\n00P"
+
+
+@pytest.mark.virtual
+async def test_what_is_readable_is_told_from_noise() -> None:
+    line, sensor, _ = a_line()
+    sensor.write(b"\xf0\x0f\n\n\x80\x81\n\x82\n\n" + b"MD\n99b\n\n")
+    await asyncio.sleep(0.1)
+    assert line.recognised == 1
+    assert line.dropped_bytes == 0
+    sensor.write(b"\xaa" * 1000)
+    await asyncio.sleep(0.1)
+    assert line.dropped_bytes == 1000
+
+
+@pytest.mark.virtual
+async def test_loss_reaches_a_question_under_way_and_every_later_one() -> None:
+    line, sensor, _ = a_line()
+    told: list[str] = []
+    line.set_on_lost(lambda: told.append("first"))
+    asyncio.get_running_loop().call_later(0.1, sensor.close)
+    with pytest.raises(DeviceMissing):
+        await line.exchange(scip.VV, 1.0)
+    with pytest.raises(DeviceMissing):
+        await line.exchange(scip.VV, 1.0)
+    line.set_on_lost(lambda: told.append("late"))
+    line.set_on_lost(None)
+    assert told == ["first", "late"]
+    assert isinstance(line.lost, DeviceMissing)
+    line.close()

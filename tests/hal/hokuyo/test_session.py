@@ -1,7 +1,5 @@
 """The session against a sensor that says exactly what a script tells it to, word by word."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
 
@@ -47,12 +45,16 @@ class Scripted:
             self.port.write(encoder.answer(line, reply))
 
 
-def with_session(script: Scripted, body: Callable[[Session], Awaitable[None]], baud: int = 0) -> None:
+def opened(script: Scripted, baud: int = 0) -> Session:
+    ours, theirs = memory_pair(LoopClock(asyncio.get_running_loop()), "/dev/x")
+    script.plug(theirs)
+    ours.set_baud(baud)
+    return Session(Line(ours), baud)
+
+
+def with_session(script: Scripted, body: Callable[[Session], Awaitable[None]]) -> None:
     async def main() -> None:
-        ours, theirs = memory_pair(LoopClock(asyncio.get_running_loop()), "/dev/x")
-        script.plug(theirs)
-        ours.set_baud(baud)
-        await body(Session(Line(ours), baud))
+        await body(opened(script))
 
     run_virtual(main())
 
@@ -143,191 +145,160 @@ class TestSettle:
         with_session(script, body)
 
 
+@pytest.mark.virtual
 class TestReset:
-    def test_before_anything_is_known_only_rs(self) -> None:
+    async def test_before_anything_is_known_only_rs(self) -> None:
         script = Scripted(RS=[None, OK], QT=[OK])
-        with_session(script, lambda session: session.reset())
+        await opened(script).reset()
         assert script.received == ["RS", "RS", "QT"]
 
-    def test_a_model_that_has_rt_keeps_its_rate(self) -> None:
+    async def test_a_model_that_has_rt_keeps_its_rate(self) -> None:
         script = Scripted(RT=[OK], QT=[OK], **GOOD)
-
-        async def body(session: Session) -> None:
-            await session.identify()
-            await session.reset()
-
-        with_session(script, body)
+        session = opened(script)
+        await session.identify()
+        await session.reset()
         assert "RT" in script.received
         assert "RS" not in script.received
 
-    def test_rs_on_a_serial_line_means_finding_the_rate_again(self) -> None:
+    async def test_rs_on_a_serial_line_means_finding_the_rate_again(self) -> None:
         script = Scripted(RS=[OK], QT=[None, None, OK])
+        session = opened(script, baud=115200)
+        await session.reset()
+        assert session.baud == 57600
 
-        async def body(session: Session) -> None:
-            await session.reset()
-            assert session.baud == 57600
-
-        with_session(script, body, baud=115200)
-
-    def test_no_answer(self) -> None:
+    async def test_no_answer(self) -> None:
         with pytest.raises(DeviceFault, match="does not answer a reset"):
-            with_session(Scripted(), lambda session: session.reset())
+            await opened(Scripted()).reset()
 
-    def test_reboot_is_a_pair_and_never_raises(self) -> None:
+    async def test_reboot_is_a_pair_and_never_raises(self) -> None:
         script = Scripted(RB=["01", OK])
-
-        async def body(session: Session) -> None:
-            began = asyncio.get_running_loop().time()
-            await session.reboot()
-            assert script.received == ["RB", "RB"]
-            assert asyncio.get_running_loop().time() - began < 4.0
-            script.port.close()
-            await asyncio.sleep(0)
-            await session.reboot()
-
-        with_session(script, body)
+        session = opened(script)
+        began = asyncio.get_running_loop().time()
+        await session.reboot()
+        assert script.received == ["RB", "RB"]
+        assert asyncio.get_running_loop().time() - began < 4.0
+        script.port.close()
+        await asyncio.sleep(0)
+        await session.reboot()
 
 
+@pytest.mark.virtual
 class TestIdentify:
-    def test_good(self) -> None:
+    async def test_good(self) -> None:
         script = Scripted(**GOOD, II=[encoder.text("II", [("STAT", "Sensor works well.")])])
-
-        async def body(session: Session) -> None:
-            who = await session.identify()
-            assert (who.geometry.serial, session.report.health) == ("H0900001", "Sensor works well.")
-
-        with_session(script, body)
+        session = opened(script)
+        who = await session.identify()
+        assert (who.geometry.serial, session.report.health) == ("H0900001", "Sensor works well.")
         assert script.received == ["VV", "PP", "II"]
 
-    def test_without_ii(self) -> None:
-        async def body(session: Session) -> None:
-            await session.identify()
-            assert session.report == SelfReport()
+    async def test_without_ii(self) -> None:
+        session = opened(Scripted(**GOOD, QT=[OK]))
+        await session.identify()
+        assert session.report == SelfReport()
 
-        with_session(Scripted(**GOOD, QT=[OK]), body)
-
-    def test_left_in_time_adjustment_by_firmware_that_grants_qt_there(self) -> None:
+    async def test_left_in_time_adjustment_by_firmware_that_grants_qt_there(self) -> None:
         script = Scripted(VV=["0E", *GOOD["VV"]], PP=GOOD["PP"], TM2=[OK], QT=[OK])
-        with_session(script, lambda session: session.identify())  # type: ignore[arg-type, return-value]  # result unused
+        await opened(script).identify()
         assert script.received[:3] == ["VV", "TM2", "QT"]
 
-    def test_damaged_once(self) -> None:
+    async def test_damaged_once(self) -> None:
         damaged = GOOD["PP"][0].replace(b"1080", b"1081")
         script = Scripted(VV=GOOD["VV"], PP=[damaged, *GOOD["PP"]])
-
-        async def body(session: Session) -> None:
-            assert (await session.identify()).geometry.amax == 1080
-
-        with_session(script, body)
+        session = opened(script)
+        assert (await session.identify()).geometry.amax == 1080
         assert script.received.count("PP") == 2
 
-    def test_the_same_wrong_sum_twice_is_the_firmwares_own_way(self) -> None:
+    async def test_the_same_wrong_sum_twice_is_the_firmwares_own_way(self) -> None:
         odd = GOOD["VV"][0].replace(b"SERI:H0900001;" + GOOD["VV"][0].rstrip()[-1:], b"SERI:H0900001;0")
         script = Scripted(VV=[odd], PP=GOOD["PP"])
-
-        async def body(session: Session) -> None:
-            assert (await session.identify()).geometry.serial == "H0900001"
-
-        with_session(script, body)
+        session = opened(script)
+        assert (await session.identify()).geometry.serial == "H0900001"
         assert script.received.count("VV") == 2
 
-    def test_never_readable(self) -> None:
+    async def test_never_readable(self) -> None:
         replies: list[str | bytes | None] = [GOOD["PP"][0].replace(b"1080", b"108%d" % i) for i in range(1, 9)]
         with pytest.raises(DeviceFault, match="PP: checksum"):
-            with_session(Scripted(VV=GOOD["VV"], PP=replies), lambda session: session.identify())  # type: ignore[arg-type, return-value]  # raises
+            await opened(Scripted(VV=GOOD["VV"], PP=replies)).identify()
 
-    def test_vv_that_is_never_readable_is_not_needed(self) -> None:
+    async def test_vv_that_is_never_readable_is_not_needed(self) -> None:
         others = (
             b"H09%05d" % i for i in range(20, 60) if sum(map(int, str(i))) not in (1, 6)
         )  # sums with and without ;
         replies: list[str | bytes | None] = [GOOD["VV"][0].replace(b"H0900001", other) for other in others]
-
-        async def body(session: Session) -> None:
-            assert (await session.identify()).geometry.serial == ""
-
-        with_session(Scripted(VV=replies, PP=GOOD["PP"]), body)
+        session = opened(Scripted(VV=replies, PP=GOOD["PP"]))
+        assert (await session.identify()).geometry.serial == ""
 
     @pytest.mark.parametrize("answer", ["10", "0E", "0M", None])
-    def test_pp_refused_or_not_answered_is_a_sensor_that_starts(self, answer: str | None) -> None:
+    async def test_pp_refused_or_not_answered_is_a_sensor_that_starts(self, answer: str | None) -> None:
         with pytest.raises(NotReady, match="PP: "):
-            with_session(Scripted(QT=[OK], TM2=["10"], VV=[answer], PP=[answer]), lambda session: session.identify())  # type: ignore[arg-type, return-value]  # raises
+            await opened(Scripted(QT=[OK], TM2=["10"], VV=[answer], PP=[answer])).identify()
 
-    def test_no_lidar(self) -> None:
+    async def test_no_lidar(self) -> None:
         script = Scripted(VV=GOOD["VV"], PP=[encoder.text("PP", [("MODL", "Coffee machine")])])
         with pytest.raises(DeviceRefused, match="PP reply has DMIN='', expected a number"):
-            with_session(script, lambda session: session.identify())  # type: ignore[arg-type, return-value]  # raises
+            await opened(script).identify()
 
 
+@pytest.mark.virtual
 class TestRate:
-    def test_accepted(self) -> None:
+    async def test_accepted(self) -> None:
         script = Scripted(SS=[OK], **GOOD)
-
-        async def body(session: Session) -> None:
-            await session.set_rate(250000)
-            assert session.baud == 250000
-
-        with_session(script, body, baud=19200)
+        session = opened(script, baud=19200)
+        await session.set_rate(250000)
+        assert session.baud == 250000
         assert script.received == ["SS250000", "VV"]
         assert script.bauds == [19200, 250000]
 
     @pytest.mark.parametrize("status", ["02", "04", "0F", None])
-    def test_refused(self, status: str | None) -> None:
-        async def body(session: Session) -> None:
-            await session.set_rate(250000)
-            assert session.baud == 19200
+    async def test_refused(self, status: str | None) -> None:
+        session = opened(Scripted(SS=[status]), baud=19200)
+        await session.set_rate(250000)
+        assert session.baud == 19200
 
-        with_session(Scripted(SS=[status]), body, baud=19200)
-
-    def test_lost_on_the_way(self) -> None:
+    async def test_lost_on_the_way(self) -> None:
         with pytest.raises(DeviceFault, match="lost after the change to 250000"):
-            with_session(Scripted(SS=[OK]), lambda session: session.set_rate(250000), baud=19200)
+            await opened(Scripted(SS=[OK]), baud=19200).set_rate(250000)
 
-    def test_an_adapter_that_cannot_do_it_is_found_out_before_the_sensor_changes(self) -> None:
+    async def test_an_adapter_that_cannot_do_it_is_found_out_before_the_sensor_changes(self) -> None:
         script = Scripted(SS=[OK], QT=[OK])
+        session = opened(script, baud=19200)
+        port = session.line.port
+        assert isinstance(port, MemoryPort)
+        plain = port.set_baud
 
-        async def body(session: Session) -> None:
-            port = session.line.port
-            assert isinstance(port, MemoryPort)
-            plain = port.set_baud
+        def limited(baud: int) -> None:
+            if baud > 115200:
+                raise DeviceRefused("/dev/x", f"cannot do {baud} bit/s")
+            plain(baud)
 
-            def limited(baud: int) -> None:
-                if baud > 115200:
-                    raise DeviceRefused("/dev/x", f"cannot do {baud} bit/s")
-                plain(baud)
+        port.set_baud = limited  # type: ignore[method-assign]  # an adapter with limits
+        with pytest.raises(DeviceRefused):
+            await session.set_rate(250000)
+        assert script.received == []
+        assert port.baud == 19200
+        await session.find_rate(750000)
+        assert session.baud == 19200
 
-            port.set_baud = limited  # type: ignore[method-assign]  # an adapter with limits
-            with pytest.raises(DeviceRefused):
-                await session.set_rate(250000)
-            assert script.received == []
-            assert port.baud == 19200
-            await session.find_rate(750000)
-            assert session.baud == 19200
-
-        with_session(script, body, baud=19200)
-
-    def test_any_frame_betrays_the_right_rate(self) -> None:
+    async def test_any_frame_betrays_the_right_rate(self) -> None:
         """A sensor that streams may take long to say so; a frame of its stream is answer enough."""
         frame = encoder.scan("MD0000000201000", 1, "0CB1Dh7D`")
         script = Scripted(QT=[None, None, frame])
+        session = opened(script)
+        await session.find_rate()
+        assert session.baud == 57600
 
-        async def body(session: Session) -> None:
-            await session.find_rate()
-            assert session.baud == 57600
-
-        with_session(script, body)
-
-    def test_no_rate(self) -> None:
+    async def test_no_rate(self) -> None:
         script = Scripted()
         with pytest.raises(DeviceFault, match="no reply at any line rate"):
-            with_session(script, lambda session: session.find_rate(250000))
+            await opened(script).find_rate(250000)
         assert script.bauds == [250000, 19200, 38400, 57600, 115200, 500000, 750000]
 
-    def test_what_talks_and_is_no_lidar_is_shown_as_it_is_read_best(self) -> None:
+    async def test_what_talks_and_is_no_lidar_is_shown_as_it_is_read_best(self) -> None:
         """At all rates but its own it is no text."""
         noise = b"\x80\xf8\x00" * 10
         script = Scripted(QT=[None, noise, b"$GPRMC,1235\r\n", noise])
         with pytest.raises(DeviceFault, match=r"only unreadable bytes arrive .*'\$GPRMC,1235': name the lidar's port"):
-            with_session(script, lambda session: session.find_rate())
+            await opened(script).find_rate()
 
 
 class TestStart:

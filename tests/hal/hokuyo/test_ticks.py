@@ -1,7 +1,5 @@
 """Sensor stamps to monotonic time, in virtual time: wraps, rates, jitter, resets, damage, stalls, changing motors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,10 +1,12 @@
-"""Sockets get half of the loop's time, and everything that waited is served afterwards."""
-
-from __future__ import annotations
+"""Addresses, and the share that each of them has."""
 
 import asyncio
 import socket
 
+import pytest
+
+from hal.errors import DeviceMissing
+from hal.net import inet
 from hal.net.fair_share import PART, SLICE_S, Reader, Share
 
 
@@ -54,37 +56,33 @@ def test_a_clock_that_steps_back_holds_nobody_for_ever() -> None:
     assert share.begin()
 
 
-def test_a_flood_waits_for_the_next_slice_and_is_served_then() -> None:
+async def test_a_flood_waits_for_the_next_slice_and_is_served_then() -> None:
     served = 0
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ours.setblocking(False)
+    watch = Watch()
+    share = Share(watch)
 
-    async def run() -> tuple[int, int]:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        ours.setblocking(False)
-        watch = Watch()
-        share = Share(watch)
+    def serve() -> None:
+        nonlocal served
+        served += len(ours.recv(1))
+        watch.t += 0.6 * PART * SLICE_S
 
-        def serve() -> None:
-            nonlocal served
-            served += len(ours.recv(1))
-            watch.t += 0.6 * PART * SLICE_S
-
-        reader = Reader(ours.fileno(), serve, share)
-        for _ in range(6):
-            theirs.send(b"x")
-        await asyncio.sleep(0.005)
-        first = served
-        for _ in range(200):
-            watch.t += 0.1 * SLICE_S
-            await asyncio.sleep(0.001)
-        reader.close()
-        reader.close()
-        theirs.send(b"y")
-        await asyncio.sleep(0.02)
-        ours.close()
-        theirs.close()
-        return first, served
-
-    assert asyncio.run(run()) == (2, 6)
+    reader = Reader(ours.fileno(), serve, share)
+    for _ in range(6):
+        theirs.send(b"x")
+    await asyncio.sleep(0.005)
+    first = served
+    for _ in range(200):
+        watch.t += 0.1 * SLICE_S
+        await asyncio.sleep(0.001)
+    reader.close()
+    reader.close()
+    theirs.send(b"y")
+    await asyncio.sleep(0.02)
+    ours.close()
+    theirs.close()
+    assert (first, served) == (2, 6)
 
 
 async def test_closing_while_waiting_ends_it() -> None:
@@ -105,3 +103,21 @@ async def test_closing_while_waiting_ends_it() -> None:
     await asyncio.sleep(2 * SLICE_S)
     ours.close()
     theirs.close()
+
+
+@pytest.mark.parametrize("name", ["robot..local", ".local", f"{64 * 'a'}.local"])
+def test_what_cannot_be_a_name_is_missing(name: str) -> None:
+    assert inet.numeric(name, 5000) == []
+    with pytest.raises(DeviceMissing, match=r"not a host name .*63 characters"):
+        asyncio.run(inet.resolve(name, 5000))
+
+
+def test_an_interface_that_is_not_there_is_told_where_they_cannot_be_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without netlink sockets, which the service manager may forbid."""
+
+    def forbidden() -> None:
+        raise OSError(97, "Address family not supported by protocol")
+
+    monkeypatch.setattr(socket, "if_nameindex", forbidden)
+    with pytest.raises(DeviceMissing, match=r"no network interface wlan77 .*ip link"):
+        asyncio.run(inet.resolve("fe80::1%wlan77", 5000))

@@ -1,7 +1,5 @@
 """Odometry and IMU datagrams: bytes by hand, damage, order, restarts, two senders, times."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math
@@ -254,32 +252,28 @@ def test_another_clock_is_not_mixed_with_ours() -> None:
 # --- over a real socket ----------------------------------------------------------------------------------------------
 
 
-def test_sources_share_one_port_and_stamp_with_the_kernels_time() -> None:
+async def test_sources_share_one_port_and_stamp_with_the_kernels_time() -> None:
     """The loop is held up for 0.2 s with datagrams in the socket: their stamps are of arrival, not of reading."""
     odometry: list[RawOdometry] = []
     imu: list[RawImu] = []
-
-    async def run() -> tuple[float, float]:
-        port = InputPort(SystemClock(), "127.0.0.1", 0)
-        tasks = [asyncio.create_task(port.odometry.run(odometry.append)), asyncio.create_task(port.imu.run(imu.append))]
-        await asyncio.sleep(0.01)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            before = time.monotonic()
-            for seq in range(20):
-                sender.sendto(datagram(seq, (seq, 0.0, 0.0)), ("127.0.0.1", port.port))
-            sender.sendto(encode(InputDatagram(IMU_MAGIC, 1, 0, 0, 0.0, (0.5,))), ("127.0.0.1", port.port))
-            after = time.monotonic()
-        time.sleep(0.2)  # noqa: ASYNC251  # the loop is to be held up
-        await asyncio.sleep(0.05)
-        address = port.port
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-            free.bind(("127.0.0.1", address))
-        return before, after
-
-    before, after = asyncio.run(run())
+    port = InputPort(SystemClock(), "127.0.0.1", 0)
+    tasks = [asyncio.create_task(port.odometry.run(odometry.append)), asyncio.create_task(port.imu.run(imu.append))]
+    await asyncio.sleep(0.01)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        before = time.monotonic()
+        for seq in range(20):
+            sender.sendto(datagram(seq, (seq, 0.0, 0.0)), ("127.0.0.1", port.port))
+        sender.sendto(encode(InputDatagram(IMU_MAGIC, 1, 0, 0, 0.0, (0.5,))), ("127.0.0.1", port.port))
+        after = time.monotonic()
+    time.sleep(0.2)  # noqa: ASYNC251  # the loop is to be held up
+    await asyncio.sleep(0.05)
+    address = port.port
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", address))
+    before, after = (before, after)
     assert [o.x for o in odometry] == [float(n) for n in range(20)]
     assert len(imu) == 1
     for reading in (*odometry, *imu):

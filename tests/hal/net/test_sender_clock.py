@@ -1,7 +1,5 @@
 """The time of readings that another computer stamps: what is held up is dated back, and no clock does harm."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import pairwise

@@ -1,10 +1,10 @@
 """A bench for converter tests: the fake in virtual time, or the real one named by ``--adc`` in real time."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ from hal.fake.adc.converter import FakeAdc, FakeBuses
 from hal.fake.adc.i2c_adapters import BCM2835, Adapter
 from hal.fake.faults.schedule import FaultSchedule
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
+from tests.hal.driven import played, running
 
 BUS = "/dev/i2c-7"  # a name only; nothing is opened under it
 Array = npt.NDArray[np.float64]
@@ -70,8 +71,8 @@ class Bench:
             self.bus, self.address, self.chip, clock=self.clock, opener=self.opener, sampling=sampling or Sampling()
         )
 
-    def running(self, driver: PhotodiodeAdc) -> Running:
-        return Running(driver, self.blocks.append)
+    def running(self, driver: PhotodiodeAdc) -> AbstractAsyncContextManager[asyncio.Task[None]]:
+        return running(driver.run(self.blocks.append))
 
     async def more(self, count: int, within: float, driver: PhotodiodeAdc) -> list[RawSamples]:
         """Wait for ``count`` more blocks; fails if that takes longer than ``within``."""
@@ -92,26 +93,6 @@ class Bench:
         return self.fake
 
 
-class Running:
-    """A driver that runs inside an ``async with``, cancelled at its end."""
-
-    def __init__(self, driver: PhotodiodeAdc, on_samples: Callable[[RawSamples], None]) -> None:
-        self._driver, self._on_samples = driver, on_samples
-
-    async def __aenter__(self) -> asyncio.Task[None]:
-        self.task = asyncio.create_task(self._driver.run(self._on_samples))
-        return self.task
-
-    async def __aexit__(self, *_: object) -> None:
-        assert not self.task.done(), "the driver must never end by itself"
-        self.task.cancel()
-        try:
-            await self.task
-        except asyncio.CancelledError:
-            return
-        raise AssertionError("the driver swallowed its cancellation")
-
-
 Body = Callable[[Bench], Awaitable[None]]
 
 
@@ -129,6 +110,11 @@ def on_fake(body: Body, chip: str = "MCP3221", address: int = 0x4D, adapter: Ada
         faults.close()
 
     run_virtual(main(), start=1000.0)
+
+
+def faked(*where: Any, **how: Any) -> Callable[..., Callable[..., None]]:
+    """A coroutine test on the fake converter, in virtual time; arguments as of :func:`on_fake`."""
+    return played(lambda body: on_fake(body, *where, **how))
 
 
 def on_bench(body: Body, adc: str) -> None:

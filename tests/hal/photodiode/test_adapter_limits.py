@@ -1,7 +1,5 @@
 """How long a read an adapter carries through."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import os

@@ -1,7 +1,5 @@
 """Bytes of the converters, by their data sheets, worked out by hand."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

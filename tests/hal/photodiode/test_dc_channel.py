@@ -1,7 +1,5 @@
 """The DC channel: dark, dazzled and dead told apart; whatever happens to it, sampling goes on."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 
@@ -11,7 +9,7 @@ import pytest
 from hal.adc import Blemish
 from hal.photodiode.dc_channel import LevelInput
 from hal.photodiode.driver import Sampling
-from tests.hal.photodiode.bench import Bench, on_fake
+from tests.hal.photodiode.bench import Bench, faked, on_fake
 
 DC = Sampling(level=LevelInput(full_scale_v=3.0, rest_v=0.0))
 
@@ -21,45 +19,37 @@ def with_level(bench: Bench, volts: float = 1.2, chip: str = "ADS1115") -> None:
 
 
 @pytest.mark.parametrize("chip", ["ADS1115", "ADS1015"])
-def test_level_is_read_between_blocks(chip: str) -> None:
-    async def body(bench: Bench) -> None:
-        with_level(bench, chip=chip)
-        driver = bench.driver(DC)
-        async with bench.running(driver):
-            blocks = await bench.more(60, 10.0, driver)
-        assert driver.status.extra["dc_level"] == "40.0 %"
-        assert not any(block.blemish for block in blocks)
-
-    on_fake(body)
+@faked()
+async def test_level_is_read_between_blocks(bench: Bench, chip: str) -> None:
+    with_level(bench, chip=chip)
+    driver = bench.driver(DC)
+    async with bench.running(driver):
+        blocks = await bench.more(60, 10.0, driver)
+    assert driver.status.extra["dc_level"] == "40.0 %"
+    assert not any(block.blemish for block in blocks)
 
 
-def test_level_counts_from_rest() -> None:
+@faked()
+async def test_level_counts_from_rest(bench: Bench) -> None:
     """0.1 V is no light: the amplifier's bias."""
-
-    async def body(bench: Bench) -> None:
-        with_level(bench, 1.7)
-        driver = bench.driver(Sampling(level=LevelInput()))
-        async with bench.running(driver):
-            await bench.more(30, 10.0, driver)
-        assert driver.status.extra["dc_level"] == "50.0 %"
-
-    on_fake(body)
+    with_level(bench, 1.7)
+    driver = bench.driver(Sampling(level=LevelInput()))
+    async with bench.running(driver):
+        await bench.more(30, 10.0, driver)
+    assert driver.status.extra["dc_level"] == "50.0 %"
 
 
-def test_light_without_lamps_is_neither_dark_nor_dead() -> None:
+@faked()
+async def test_light_without_lamps_is_neither_dark_nor_dead(bench: Bench) -> None:
     """Daylight only: nothing flickers, the converter's own noise goes on."""
-
-    async def body(bench: Bench) -> None:
-        noise = np.random.default_rng(4)
-        bench.device._source = lambda t: 0.5 + 1.1e-4 * noise.standard_normal(t.size)
-        with_level(bench)
-        driver = bench.driver(DC)
-        async with bench.running(driver):
-            await bench.more(60, 10.0, driver)
-            assert "there is light, but no modulated light" in str(driver.status.error)
-            assert driver.status.recoveries == 0
-
-    on_fake(body)
+    noise = np.random.default_rng(4)
+    bench.device._source = lambda t: 0.5 + 1.1e-4 * noise.standard_normal(t.size)
+    with_level(bench)
+    driver = bench.driver(DC)
+    async with bench.running(driver):
+        await bench.more(60, 10.0, driver)
+        assert "there is light, but no modulated light" in str(driver.status.error)
+        assert driver.status.recoveries == 0
 
 
 @pytest.mark.parametrize("late", [0.0, 0.3, 0.6, 0.9])
@@ -71,40 +61,36 @@ def test_light_without_lamps_is_neither_dark_nor_dead() -> None:
         ("stuck", "the converter or its input is defective .*wire"),
     ],
 )
-def test_causes_are_told_apart(fault: str, says: str, late: float) -> None:
-    async def body(bench: Bench) -> None:
-        with_level(bench)
-        driver = bench.driver(DC)
-        async with bench.running(driver):
-            await bench.more(30, 10.0, driver)
-            await asyncio.sleep(late)
-            bench.order(f"what = '{fault}'")
-            told: set[str] = set()
-            for _ in range(300):
-                await asyncio.sleep(0.01)
-                told |= {str(driver.status.error)} if driver.status.error else set()
-            assert len(told) == 1, told  # and never another cause first
-            with pytest.raises(AssertionError, match=says):
-                raise AssertionError(str(driver.status.error))
-            bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
-            await asyncio.sleep(2.0)
-            assert driver.status.error is None
-
-    on_fake(body)
+@faked()
+async def test_causes_are_told_apart(bench: Bench, fault: str, says: str, late: float) -> None:
+    with_level(bench)
+    driver = bench.driver(DC)
+    async with bench.running(driver):
+        await bench.more(30, 10.0, driver)
+        await asyncio.sleep(late)
+        bench.order(f"what = '{fault}'")
+        told: set[str] = set()
+        for _ in range(300):
+            await asyncio.sleep(0.01)
+            told |= {str(driver.status.error)} if driver.status.error else set()
+        assert len(told) == 1, told  # and never another cause first
+        with pytest.raises(AssertionError, match=says):
+            raise AssertionError(str(driver.status.error))
+        bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
+        await asyncio.sleep(2.0)
+        assert driver.status.error is None
 
 
-def test_a_converter_that_is_dark_for_a_known_reason_is_left_alone() -> None:
-    async def body(bench: Bench) -> None:
-        with_level(bench)
-        driver = bench.driver(DC)
-        async with bench.running(driver):
-            await bench.more(30, 10.0, driver)
-            bench.order("what = 'dark'")
-            await asyncio.sleep(100.0)
-            assert driver.status.recoveries == 0
-            assert driver.status.blocks > 1900
-
-    on_fake(body)
+@faked()
+async def test_a_converter_that_is_dark_for_a_known_reason_is_left_alone(bench: Bench) -> None:
+    with_level(bench)
+    driver = bench.driver(DC)
+    async with bench.running(driver):
+        await bench.more(30, 10.0, driver)
+        bench.order("what = 'dark'")
+        await asyncio.sleep(100.0)
+        assert driver.status.recoveries == 0
+        assert driver.status.blocks > 1900
 
 
 def test_a_dead_converter_is_started_afresh_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
@@ -127,38 +113,33 @@ def test_a_dead_converter_is_started_afresh_now_and_then(caplog: pytest.LogCaptu
     ("fault", "says"),
     [("what = 'dc_off'", "has no registers"), ("what = 'error'; name = 'EIO'; on = 'all'", None)],
 )
-def test_sampling_goes_on_without_it(fault: str, says: str | None) -> None:
-    async def body(bench: Bench) -> None:
-        with_level(bench)
-        driver = bench.driver(DC)
-        async with bench.running(driver):
-            await bench.more(30, 10.0, driver)
-            bench.order(fault)
-            await asyncio.sleep(6.0)
-            if says:
-                assert says in driver.status.extra["dc_level"]
-                assert driver.status.blocks > 140
-            bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
-            await asyncio.sleep(10.0)
-            assert driver.status.extra["dc_level"] == "40.0 %"
-
-    on_fake(body)
+@faked()
+async def test_sampling_goes_on_without_it(bench: Bench, fault: str, says: str | None) -> None:
+    with_level(bench)
+    driver = bench.driver(DC)
+    async with bench.running(driver):
+        await bench.more(30, 10.0, driver)
+        bench.order(fault)
+        await asyncio.sleep(6.0)
+        if says:
+            assert says in driver.status.extra["dc_level"]
+            assert driver.status.blocks > 140
+        bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
+        await asyncio.sleep(10.0)
+        assert driver.status.extra["dc_level"] == "40.0 %"
 
 
-def test_a_brownout_of_the_dc_channel_is_no_darkness() -> None:
+@faked()
+async def test_a_brownout_of_the_dc_channel_is_no_darkness(bench: Bench) -> None:
     """After a reset it converts nothing and reads 0: its configuration is looked at before every reading."""
-
-    async def body(bench: Bench) -> None:
-        with_level(bench)
-        driver = bench.driver(DC)
-        async with bench.running(driver):
-            await bench.more(30, 10.0, driver)
-            for _ in range(5):
-                bench.order("what = 'brownout'")
-                await asyncio.sleep(1.3)
-                assert driver.status.extra["dc_level"] == "40.0 %"
-
-    on_fake(body)
+    with_level(bench)
+    driver = bench.driver(DC)
+    async with bench.running(driver):
+        await bench.more(30, 10.0, driver)
+        for _ in range(5):
+            bench.order("what = 'brownout'")
+            await asyncio.sleep(1.3)
+            assert driver.status.extra["dc_level"] == "40.0 %"
 
 
 @pytest.mark.parametrize("every_s", [0.02, 0.3, 1.1])
@@ -197,15 +178,13 @@ def test_another_program_on_the_chip_is_noticed_and_its_input_is_no_level(
 
 
 @pytest.mark.parametrize("wrong", ["LM75", "24C02"])
-def test_another_chip_in_its_place(wrong: str) -> None:
-    async def body(bench: Bench) -> None:
-        bench.device.add_level(lambda t: np.full_like(t, 0.5), chip=wrong)
-        driver = bench.driver(DC)
-        async with bench.running(driver):
-            await bench.more(30, 10.0, driver)
-        assert "thresholds" in driver.status.extra["dc_level"]
-
-    on_fake(body)
+@faked()
+async def test_another_chip_in_its_place(bench: Bench, wrong: str) -> None:
+    bench.device.add_level(lambda t: np.full_like(t, 0.5), chip=wrong)
+    driver = bench.driver(DC)
+    async with bench.running(driver):
+        await bench.more(30, 10.0, driver)
+    assert "thresholds" in driver.status.extra["dc_level"]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """The driver's conduct while nothing is wrong; the first tests also run on a real converter (``--adc``)."""
 
-from __future__ import annotations
-
 import asyncio
 from itertools import pairwise
 
@@ -13,7 +11,7 @@ from hal.bus.i2c import AsyncBus
 from hal.fake.adc.i2c_adapters import BCM2835, CH341, CP2112, DESIGNWARE, FT260, I2C_GPIO, Adapter
 from hal.lidar import Link
 from hal.photodiode.driver import PhotodiodeAdc, Sampling
-from tests.hal.photodiode.bench import Bench, falsehoods, on_bench, on_fake
+from tests.hal.photodiode.bench import Bench, faked, falsehoods, on_bench, on_fake
 
 
 @pytest.fixture
@@ -65,48 +63,41 @@ def test_words_and_times_are_the_converters_own(chip: str, address: int, adapter
 
 
 @pytest.mark.parametrize("percent", [-1.0, 1.0, -37.0])
-def test_scl_is_measured(percent: float) -> None:
-    async def body(bench: Bench) -> None:
-        bench.device.bus.scl_error = 0.01 * percent
-        driver = bench.driver()
-        async with bench.running(driver):
-            blocks = await bench.more(300, 40.0, driver)
-        true_hz = 400e3 * (1.0 + 0.01 * percent) / 18
-        assert abs(blocks[0].rate_hz / true_hz - 1.0) < 500e-6
-        assert abs(blocks[-1].rate_hz / true_hz - 1.0) < 100e-6
-        assert abs(blocks[-1].words.size / true_hz - 0.05) < 1e-3
-        assert driver.status.extra["scl"] == f"{18e-3 * blocks[-20].rate_hz:.2f} kHz"
-
-    on_fake(body)
+@faked()
+async def test_scl_is_measured(bench: Bench, percent: float) -> None:
+    bench.device.bus.scl_error = 0.01 * percent
+    driver = bench.driver()
+    async with bench.running(driver):
+        blocks = await bench.more(300, 40.0, driver)
+    true_hz = 400e3 * (1.0 + 0.01 * percent) / 18
+    assert abs(blocks[0].rate_hz / true_hz - 1.0) < 500e-6
+    assert abs(blocks[-1].rate_hz / true_hz - 1.0) < 100e-6
+    assert abs(blocks[-1].words.size / true_hz - 0.05) < 1e-3
+    assert driver.status.extra["scl"] == f"{18e-3 * blocks[-20].rate_hz:.2f} kHz"
 
 
-def test_blocks_are_read_back_to_back() -> None:
-    async def body(bench: Bench) -> None:
-        driver = bench.driver()
-        async with bench.running(driver):
-            blocks = await bench.more(50, 10.0, driver)
-        pauses = [late.t0 - early.t1 for early, late in pairwise(blocks)]
-        assert max(pauses) < 1e-3
-
-    on_fake(body)
+@faked()
+async def test_blocks_are_read_back_to_back(bench: Bench) -> None:
+    driver = bench.driver()
+    async with bench.running(driver):
+        blocks = await bench.more(50, 10.0, driver)
+    pauses = [late.t0 - early.t1 for early, late in pairwise(blocks)]
+    assert max(pauses) < 1e-3
 
 
-def test_first_word_after_a_pause_is_left_out() -> None:
+@faked()
+async def test_first_word_after_a_pause_is_left_out(bench: Bench) -> None:
     """It was sampled when the transaction before the pause ended."""
-
-    async def body(bench: Bench) -> None:
-        driver = bench.driver()
-        async with bench.running(driver):
-            before = await bench.more(3, 10.0, driver)
-            bench.order("what = 'nack'; count = 4")  # three retries do not help: reopened a second later
-            after = await bench.more(5, 10.0, driver)
-        returned = [block for block in after if block.blemish]
-        assert [block.blemish for block in returned] == [Blemish.GAP]
-        assert returned[0].t0 - before[-1].t1 > 0.8
-        assert before[0].words.size == returned[0].words.size == before[1].words.size - 1
-        assert falsehoods(bench, bench.blocks) == []
-
-    on_fake(body)
+    driver = bench.driver()
+    async with bench.running(driver):
+        before = await bench.more(3, 10.0, driver)
+        bench.order("what = 'nack'; count = 4")  # three retries do not help: reopened a second later
+        after = await bench.more(5, 10.0, driver)
+    returned = [block for block in after if block.blemish]
+    assert [block.blemish for block in returned] == [Blemish.GAP]
+    assert returned[0].t0 - before[-1].t1 > 0.8
+    assert before[0].words.size == returned[0].words.size == before[1].words.size - 1
+    assert falsehoods(bench, bench.blocks) == []
 
 
 @pytest.mark.parametrize(
@@ -147,35 +138,29 @@ def test_nothing_is_said_of_an_adapter_that_does_not_pause(caplog: pytest.LogCap
     assert not caplog.records
 
 
-def test_an_adapter_that_cannot_read_blocks_is_refused() -> None:
-    async def body(bench: Bench) -> None:
-        driver = bench.driver()
-        async with bench.running(driver):
-            await asyncio.sleep(3.0)
-            assert "cannot read 60 bytes at once" in str(driver.status.error)
-        assert not bench.blocks
-
-    on_fake(body, adapter=Adapter("SMBus thing", max_read=32))
+@faked(adapter=Adapter("SMBus thing", max_read=32))
+async def test_an_adapter_that_cannot_read_blocks_is_refused(bench: Bench) -> None:
+    driver = bench.driver()
+    async with bench.running(driver):
+        await asyncio.sleep(3.0)
+        assert "cannot read 60 bytes at once" in str(driver.status.error)
+    assert not bench.blocks
 
 
-def test_block_length_follows_the_wish() -> None:
-    async def body(bench: Bench) -> None:
-        driver = bench.driver(Sampling(block_s=0.03))
-        async with bench.running(driver):
-            blocks = await bench.more(5, 10.0, driver)
-        assert abs(blocks[-1].words.size / blocks[-1].rate_hz - 0.03) < 1e-3
-
-    on_fake(body)
+@faked()
+async def test_block_length_follows_the_wish(bench: Bench) -> None:
+    driver = bench.driver(Sampling(block_s=0.03))
+    async with bench.running(driver):
+        blocks = await bench.more(5, 10.0, driver)
+    assert abs(blocks[-1].words.size / blocks[-1].rate_hz - 0.03) < 1e-3
 
 
-def test_scl_beyond_the_data_sheet_is_told() -> None:
-    async def body(bench: Bench) -> None:
-        driver = bench.driver()
-        async with bench.running(driver):
-            await bench.more(5, 10.0, driver)
-        assert "faster than the 400 kHz" in driver.status.extra["warning"]
-
-    on_fake(body, adapter=Adapter("fast", scl_hz=1e6))
+@faked(adapter=Adapter("fast", scl_hz=1e6))
+async def test_scl_beyond_the_data_sheet_is_told(bench: Bench) -> None:
+    driver = bench.driver()
+    async with bench.running(driver):
+        await bench.more(5, 10.0, driver)
+    assert "faster than the 400 kHz" in driver.status.extra["warning"]
 
 
 @pytest.mark.parametrize(
@@ -189,96 +174,86 @@ def test_scl_beyond_the_data_sheet_is_told() -> None:
         ("mcp3221", 0x4D, float("nan"), "0.001 to 1 s"),
     ],
 )
-def test_what_cannot_be_is_refused_at_once(chip: str, address: int, block_s: float, says: str) -> None:
-    async def body(bench: Bench) -> None:
-        with pytest.raises(ValueError, match=says):
-            PhotodiodeAdc(
-                "/dev/i2c-1", address, chip, clock=bench.clock, opener=bench.opener, sampling=Sampling(block_s)
-            )
-
-    on_fake(body)
+@faked()
+async def test_what_cannot_be_is_refused_at_once(
+    bench: Bench, chip: str, address: int, block_s: float, says: str
+) -> None:
+    with pytest.raises(ValueError, match=says):
+        PhotodiodeAdc("/dev/i2c-1", address, chip, clock=bench.clock, opener=bench.opener, sampling=Sampling(block_s))
 
 
-def test_an_open_that_hangs_is_told() -> None:
-    async def body(bench: Bench) -> None:
-        real, opened = bench.opener, 0
+@faked()
+async def test_an_open_that_hangs_is_told(bench: Bench) -> None:
+    real, opened = bench.opener, 0
 
-        async def opener(name: str) -> AsyncBus:
-            nonlocal opened
-            opened += 1
-            await asyncio.sleep(20.0)
-            return await real(name)
+    async def opener(name: str) -> AsyncBus:
+        nonlocal opened
+        opened += 1
+        await asyncio.sleep(20.0)
+        return await real(name)
 
-        bench.opener = opener
-        driver = bench.driver()
-        async with bench.running(driver):
-            await asyncio.sleep(3.1)
-            assert "opening the bus has taken 3 s" in str(driver.status.error)
-            assert driver.status.link is Link.WAITING
-            await bench.more(3, 20.0, driver)
-            assert driver.status.error is None
-            assert opened == 1
-
-    on_fake(body)
+    bench.opener = opener
+    driver = bench.driver()
+    async with bench.running(driver):
+        await asyncio.sleep(3.1)
+        assert "opening the bus has taken 3 s" in str(driver.status.error)
+        assert driver.status.link is Link.WAITING
+        await bench.more(3, 20.0, driver)
+        assert driver.status.error is None
+        assert opened == 1
 
 
-def test_stopping_during_an_open_that_hangs() -> None:
-    async def body(bench: Bench) -> None:
-        ended = asyncio.Event()
+@faked()
+async def test_stopping_during_an_open_that_hangs(bench: Bench) -> None:
+    ended = asyncio.Event()
 
-        async def opener(_name: str) -> AsyncBus:
-            try:
-                await asyncio.sleep(1e6)
-            finally:
-                ended.set()
-            raise AssertionError
+    async def opener(_name: str) -> AsyncBus:
+        try:
+            await asyncio.sleep(1e6)
+        finally:
+            ended.set()
+        raise AssertionError
 
-        bench.opener = opener
-        for seconds in (1.0, 10.0):
-            ended.clear()
-            async with bench.running(bench.driver()):
-                await asyncio.sleep(seconds)
-            await asyncio.sleep(0.0)
-            assert ended.is_set()
-
-    on_fake(body)
+    bench.opener = opener
+    for seconds in (1.0, 10.0):
+        ended.clear()
+        async with bench.running(bench.driver()):
+            await asyncio.sleep(seconds)
+        await asyncio.sleep(0.0)
+        assert ended.is_set()
 
 
 @pytest.mark.parametrize("words", [1, 10])
-def test_a_damaged_word_costs_that_word_and_not_the_block(words: int) -> None:
-    async def body(bench: Bench) -> None:
-        driver = bench.driver()
-        async with bench.running(driver):
-            await bench.more(30, 10.0, driver)
-            bench.order(f"what = 'hit'; words = {words}; mask = 0xf800")
-            blocks = (await bench.more(42, 10.0, driver))[2:]
-            assert driver.status.error is None
-        times = bench.light.asked[-1]
-        codes = np.floor(4096.0 * bench.light.at(times))
-        assert all(block.blemish is Blemish.REPAIRED for block in blocks)
-        off = np.abs(blocks[-1].words.astype(float) - codes)
-        assert 0 < np.count_nonzero(off) <= words
-        assert off.max() < 0.05 * 4096
-
-    on_fake(body)
+@faked()
+async def test_a_damaged_word_costs_that_word_and_not_the_block(bench: Bench, words: int) -> None:
+    driver = bench.driver()
+    async with bench.running(driver):
+        await bench.more(30, 10.0, driver)
+        bench.order(f"what = 'hit'; words = {words}; mask = 0xf800")
+        blocks = (await bench.more(42, 10.0, driver))[2:]
+        assert driver.status.error is None
+    times = bench.light.asked[-1]
+    codes = np.floor(4096.0 * bench.light.at(times))
+    assert all(block.blemish is Blemish.REPAIRED for block in blocks)
+    off = np.abs(blocks[-1].words.astype(float) - codes)
+    assert 0 < np.count_nonzero(off) <= words
+    assert off.max() < 0.05 * 4096
 
 
 @pytest.mark.parametrize("bits", [1, 2, 3, 4])
-def test_lost_clocks_are_told_where_the_light_is_low(bits: int) -> None:
-    async def body(bench: Bench) -> None:
-        bright = bench.device._source
-        bench.device._source = lambda t: 0.01 + 0.03 * bright(t)
-        driver = bench.driver()
-        async with bench.running(driver):
-            await bench.more(30, 10.0, driver)
-            bench.order(f"what = 'shift'; bits = {bits}")
-            seen: set[str] = set()
-            for _ in range(100):
-                await asyncio.sleep(0.01)
-                seen.add(str(driver.status.error))
-            assert any("words without their highest bits (check converter type" in said for said in seen)
-            bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
-            await bench.more(20, 10.0, driver)
-            assert driver.status.error is None
-
-    on_fake(body)
+@faked()
+async def test_lost_clocks_are_told_where_the_light_is_low(bench: Bench, bits: int) -> None:
+    bright = bench.device._source
+    bench.device._source = lambda t: 0.01 + 0.03 * bright(t)
+    driver = bench.driver()
+    async with bench.running(driver):
+        await bench.more(30, 10.0, driver)
+        bench.order(f"what = 'shift'; bits = {bits}")
+        seen: set[str] = set()
+        for _ in range(100):
+            await asyncio.sleep(0.01)
+            seen.add(str(driver.status.error))
+        assert any("words without their highest bits (check converter type" in said for said in seen)
+        bench.faults.clear()  # type: ignore[union-attr]  # there is one on a fake
+        await bench.more(20, 10.0, driver)
+        assert driver.status.error is None

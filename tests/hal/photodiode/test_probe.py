@@ -1,7 +1,5 @@
 """Looking for converters: who answers is named, nothing is changed, and every trouble comes with its remedy."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 from pathlib import Path

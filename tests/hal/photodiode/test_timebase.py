@@ -1,7 +1,5 @@
 """SCL and sample times from nothing but the times around transactions."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

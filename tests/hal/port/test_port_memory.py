@@ -1,7 +1,5 @@
 """The memory port pair: order, arrival times in virtual time, closing from either side."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest

@@ -1,7 +1,5 @@
 """The serial port on a kernel pty: delivery, hang-up, exclusiveness, and every open error with its remedy."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import os

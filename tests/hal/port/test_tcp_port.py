@@ -1,7 +1,5 @@
 """The TCP port on loopback: delivery, loss, connect errors with their remedies."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import socket

@@ -1,7 +1,5 @@
 """Small logs written for the tests of this room."""
 
-from __future__ import annotations
-
 import gzip
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Raw captures of a serial line."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A CARMEN log as a device: geometry, no-return values, mount, time, and everything real logs do wrong."""
 
-from __future__ import annotations
-
 import asyncio
 import gzip
 import math

@@ -1,7 +1,5 @@
 """A monotone time for stamps that are not monotone."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import pytest

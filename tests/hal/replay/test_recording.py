@@ -1,7 +1,5 @@
 """The recording's format: what was written is read, and damage costs only what it hit."""
 
-from __future__ import annotations
-
 import struct
 import time
 import zlib

@@ -1,7 +1,5 @@
 """What a robot keeps in mind for months: who has had its name, and what its map is called."""
 
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Robots, a router and whoever looks, for real on the loopback: late joiners, names, a router that dies."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import socket

@@ -1,7 +1,5 @@
 """What a fleet's commands refuse, at once and in words."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from pathlib import Path

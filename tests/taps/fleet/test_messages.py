@@ -1,7 +1,5 @@
 """What robots tell each other: messages come back, damaged ones are refused, and who is who in the roster."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -3,8 +3,6 @@
 The robots' streams are served by this process; what joins, shares, fetches and looks are the commands themselves.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os
@@ -27,9 +25,9 @@ from daemon.publish.modbus.holding import Outcome, Request
 from tests.daemon.publish.network import publishing
 from tests.daemon.support import map_maker
 from tests.daemon.support.map_maker import Shape
-from tests.taps.routers import free_port
 from tests.taps.serving import served
 from tests.taps.test_docs import commands
+from tools.sim.ports import free_port
 
 ROOT = Path(__file__).parents[3]
 ROBOTS: Final = 5

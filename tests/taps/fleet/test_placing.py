@@ -1,7 +1,5 @@
 """What a fleet shares, on a robot's disk: newer replaces older, nothing else, and never half."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

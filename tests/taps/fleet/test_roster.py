@@ -1,7 +1,5 @@
 """Who leaves the roster, and how much of it there can be, whatever names, maps and words somebody makes up."""
 
-from __future__ import annotations
-
 import os
 import tracemalloc
 

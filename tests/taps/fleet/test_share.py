@@ -1,7 +1,5 @@
 """A survey and a map for all robots, over a real router: newer ones are followed, damaged and older ones refused."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Two simulated robots that share survey and map, as the page says it: word for word, but for the ports."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -15,7 +13,7 @@ from typing import Any
 import pytest
 
 pytest.importorskip("zenoh", reason="pip install 'lumiloop[zenoh]'")
-from tests.taps.routers import free_port
+from tools.sim.ports import free_port
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 150.0

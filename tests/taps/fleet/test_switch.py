@@ -1,7 +1,5 @@
 """A daemon is asked to go on in a map that was fetched: over its own Modbus server, as any client asks."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest
@@ -12,7 +10,8 @@ from daemon.publish.modbus.holding import CommandCode, Outcome, Request
 from taps.fleet.fetch import switched
 from taps.fleet.placing import Refused
 from tests.daemon.publish.network import publishing
-from tests.taps.routers import free_port, until
+from tests.taps.routers import until
+from tools.sim.ports import free_port
 
 
 def ask(outcome: Outcome) -> None:

@@ -1,7 +1,5 @@
 """Who reaches the Foxglove server: programs, its apps and pages that are named, under this computer's names only."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import ipaddress

@@ -1,7 +1,5 @@
 """The Foxglove live server, as the app sees it: over its WebSocket protocol (subprotocol foxglove.sdk.v1)."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import struct

@@ -1,7 +1,5 @@
 """Recordings as MCAP: read back by the libraries that their users use, and what a killed writer leaves."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """A running daemon recorded as MCAP."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What other programs would take wrongly: maps that are gone, beams without an echo."""
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A node of ROS 2 without ROS, as rmw_zenoh's subscribers see it: names, content, who comes late, what goes wrong."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import time

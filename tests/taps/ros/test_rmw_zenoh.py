@@ -1,7 +1,5 @@
 """rmw_zenoh's convention: names against the examples of its design document, attachments against Zenoh's own reader."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

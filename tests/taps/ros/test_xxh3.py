@@ -1,7 +1,5 @@
 """XXH3 against values of the reference implementation (python-xxhash 3, `xxh3_128_intdigest`), at every branch."""
 
-from __future__ import annotations
-
 import pytest
 
 from taps.ros.xxh3 import xxh3_128

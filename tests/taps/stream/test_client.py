@@ -1,7 +1,5 @@
 """The taps' client of the local stream: against the daemon's own server, and against whoever else may answer."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import zlib
@@ -125,11 +123,8 @@ async def test_a_daemon_that_goes_is_told_once_and_one_that_comes_is_greeted(
     assert seen == ["Lost", "Hello", "Lost", "Hello"]
 
 
-def test_one_that_is_not_patient_ends(tmp_path: Path) -> None:
-    async def body() -> list[Frame | Lost]:
-        return [frame async for frame in Stream(tmp_path / "none", ("pose",), patient=False).frames()]
-
-    (lost,) = asyncio.run(body())
+async def test_one_that_is_not_patient_ends(tmp_path: Path) -> None:
+    (lost,) = [frame async for frame in Stream(tmp_path / "none", ("pose",), patient=False).frames()]
     assert isinstance(lost, Lost)
 
 
@@ -240,7 +235,9 @@ def test_the_path_is_the_daemons(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert stream_path("agv") == tmp_path / "agv.stream"
 
 
-def test_a_folder_that_is_not_open_to_us_yet_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_folder_that_is_not_open_to_us_yet_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The service's folder belongs to the group of its listeners a moment after it was made."""
 
     def shut(path: Path) -> bool:
@@ -251,11 +248,9 @@ def test_a_folder_that_is_not_open_to_us_yet_is_tried_again(tmp_path: Path, monk
     monkeypatch.setattr("daemon.config.paths.SERVICE", tmp_path / "run")
     monkeypatch.setattr(Path, "exists", shut)
     assert stream_path("agv") == tmp_path / "run" / "agv.stream"
-
-    async def all_that_is_told() -> list[object]:
-        return [frame async for frame in Stream("agv", ("pose",), patient=False).frames()]
-
-    assert [type(frame) for frame in asyncio.run(all_that_is_told())] == [Lost]
+    assert [type(frame) for frame in [frame async for frame in Stream("agv", ("pose",), patient=False).frames()]] == [
+        Lost
+    ]
 
 
 def test_types_stand_for_every_topic() -> None:

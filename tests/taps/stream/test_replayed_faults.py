@@ -1,7 +1,5 @@
 """Faults of a recorded run: a replay shows them as the daemon did, to files and to browsers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

@@ -1,7 +1,5 @@
 """A page of a robot that is drawn by hand: a room with a glass wall, lamps, ten minutes of history, and no daemon."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math

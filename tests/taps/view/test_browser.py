@@ -1,11 +1,9 @@
 """The page in a real browser: Debian's chromium, over the protocol of its developer tools, on a simulated robot."""
 
-from __future__ import annotations
-
-import asyncio
+import contextlib
 import os
 import sys
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,25 +67,21 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield one
 
 
-def look(browser: str, address: str, body: Callable[[Tab], Awaitable[Any]], **options: Any) -> Any:
-    """What a body finds on the page; the browser has nothing to complain of."""
-
-    async def all_of_it() -> Any:
-        async with tab(browser, address, **options) as page:
-            await page.until(POSE, 60.0)
-            found = await body(page)
-            assert page.said == []
-            return found
-
-    return asyncio.run(all_of_it())
+@contextlib.asynccontextmanager
+async def look(browser: str, address: str, **options: Any) -> AsyncIterator[Tab]:
+    """The page with a pose; the browser has nothing to complain of."""
+    async with tab(browser, address, **options) as page:
+        await page.until(POSE, 60.0)
+        yield page
+        assert page.said == []
 
 
 async def shown(page: Tab, name: str) -> Any:
     return await page.js(f"document.getElementById({name!r}).textContent")
 
 
-def test_the_page_loads_and_the_pose_moves(browser: str, address: str) -> None:
-    async def body(page: Tab) -> dict[str, float]:
+async def test_the_page_loads_and_the_pose_moves(browser: str, address: str) -> None:
+    async with look(browser, address) as page:
         first = await page.js("lumiloop.world.pose.pose")
         await page.until(
             f"Math.hypot(lumiloop.world.pose.pose[0] - {first[0]}, lumiloop.world.pose.pose[1] - {first[1]}) > 0.3"
@@ -104,35 +98,27 @@ def test_the_page_loads_and_the_pose_moves(browser: str, address: str) -> None:
         await page.until("lumiloop.late.length >= 100")
         paint = await page.js("performance.getEntriesByType('paint')[0].startTime")
         late = await page.js("[...lumiloop.late].sort((a, b) => a - b)")
-        return {"first paint, ms": paint, "scan to screen, median, ms": late[len(late) // 2]}
-
-    found = look(browser, address, body)
-    sys.stdout.write(f"{found}\n")
-    assert found["first paint, ms"] < SLACK * FIRST_PAINT_MS
-    assert 0.0 < found["scan to screen, median, ms"] < SLACK * SHOWN_MS
+    sys.stdout.write(f"first paint {paint} ms, scan to screen {late[len(late) // 2]} ms (median)\n")
+    assert paint < SLACK * FIRST_PAINT_MS
+    assert 0.0 < late[len(late) // 2] < SLACK * SHOWN_MS
 
 
-def test_a_click_relocalises_and_who_only_looks_sees_it(browser: str, address: str) -> None:
-    async def body(page: Tab) -> None:
-        async with tab(browser, address.partition("#")[0]) as other:
-            await other.until(POSE)
-            assert await other.js("document.getElementById('card-orders').hidden")
-            await page.js("globalThis.seen = []; lumiloop.world.on_state = (told) => seen.push(told.state_name)")
-            await page.click("[data-order=relocalise]")
-            await page.click("#confirm-yes")
-            await page.until("document.querySelector('#told li')")
-            # where several places fit by the time that it is told, it says so at once
-            await page.until("seen.includes('RELOCATING') || seen.includes('AMBIGUOUS')", 60.0)
-            await other.until(
-                "[...document.querySelectorAll('#told li')].length >= 1 || document.querySelector('.toast')"
-            )
-            await page.until("document.querySelector('#told .done')", 60.0)
-
-    look(browser, address, body)
+async def test_a_click_relocalises_and_who_only_looks_sees_it(browser: str, address: str) -> None:
+    async with look(browser, address) as page, tab(browser, address.partition("#")[0]) as other:
+        await other.until(POSE)
+        assert await other.js("document.getElementById('card-orders').hidden")
+        await page.js("globalThis.seen = []; lumiloop.world.on_state = (told) => seen.push(told.state_name)")
+        await page.click("[data-order=relocalise]")
+        await page.click("#confirm-yes")
+        await page.until("document.querySelector('#told li')")
+        # where several places fit by the time that it is told, it says so at once
+        await page.until("seen.includes('RELOCATING') || seen.includes('AMBIGUOUS')", 60.0)
+        await other.until("[...document.querySelectorAll('#told li')].length >= 1 || document.querySelector('.toast')")
+        await page.until("document.querySelector('#told .done')", 60.0)
 
 
-def test_a_pose_is_set_by_dragging(browser: str, address: str) -> None:
-    async def body(page: Tab) -> None:
+async def test_a_pose_is_set_by_dragging(browser: str, address: str) -> None:
+    async with look(browser, address) as page:
         await page.click("[data-order=set_pose]")
         where, ahead = await page.js(
             "(() => { const b = document.getElementById('stage').getBoundingClientRect(), c = lumiloop.camera,"
@@ -146,11 +132,9 @@ def test_a_pose_is_set_by_dragging(browser: str, address: str) -> None:
         await page.until("document.querySelector('#told .done')", 30.0)
         assert await page.js("document.getElementById('ask').hidden")
 
-    look(browser, address, body)
 
-
-def test_a_phone(browser: str, address: str) -> None:
-    async def body(page: Tab) -> None:
+async def test_a_phone(browser: str, address: str) -> None:
+    async with look(browser, address, size=PHONE, phone=True) as page:
         wide = await page.js("[document.documentElement.scrollWidth, innerWidth]")
         assert wide[0] <= wide[1]  # nothing to be moved aside
         box = await page.js(
@@ -180,21 +164,17 @@ def test_a_phone(browser: str, address: str) -> None:
             assert cut <= 0
             assert end <= below  # what gets the focus is not behind the head
 
-    look(browser, address, body, size=PHONE, phone=True)
 
-
-def test_an_old_tab_on_another_version_loads_itself_anew(browser: str, address: str) -> None:
-    async def body(page: Tab) -> None:
+async def test_an_old_tab_on_another_version_loads_itself_anew(browser: str, address: str) -> None:
+    async with look(browser, address) as page:
         await page.js("globalThis.mark = 1")
         await page.js("lumiloop.link.page = 'of-last-year'; lumiloop.link.socket.close()")
         await page.until("document.getElementById('banner').textContent.includes('another version')")
         await page.until(f"globalThis.mark === undefined && {POSE}")
 
-    look(browser, address, body)
 
-
-def test_without_the_right_token_a_page_only_looks(browser: str, address: str) -> None:
-    async def body(page: Tab) -> None:
+async def test_without_the_right_token_a_page_only_looks(browser: str, address: str) -> None:
+    async with look(browser, address.partition("#")[0] + "#token=not-the-right-one") as page:
         for number in range(9):  # in a building that the robot knows by heart
             loop = f"{{counter: {number}, keyframe_new: {number}, keyframe_old: 0, residual: 0.01, reason: 0}}"
             await page.js(f"lumiloop.link.told.frame('loop', {loop})")
@@ -204,25 +184,20 @@ def test_without_the_right_token_a_page_only_looks(browser: str, address: str) -
         assert await page.js("document.getElementById('card-orders').hidden")
         assert await shown(page, "mode") == "read-only"
 
-    look(browser, address.partition("#")[0] + "#token=not-the-right-one", body)
 
-
-def test_a_token_that_is_pasted_after_a_refusal_is_tried(browser: str, address: str) -> None:
-    async def body(page: Tab) -> None:
+async def test_a_token_that_is_pasted_after_a_refusal_is_tried(browser: str, address: str) -> None:
+    async with look(browser, address.partition("#")[0]) as page:
         await page.js("lumiloop.link.refused = 'token'; lumiloop.link.socket.close()")
         await page.until("lumiloop.link.socket === null")
         await page.js(f"location.hash = {address.partition('#')[2]!r}")
         await page.until("lumiloop.link.socket && document.getElementById('mode').textContent === 'control'", 20.0)
 
-    look(browser, address.partition("#")[0], body)
 
-
-def test_a_connection_that_answers_no_more_is_opened_again_and_orders_are_not_lost_unsaid(
+async def test_a_connection_that_answers_no_more_is_opened_again_and_orders_are_not_lost_unsaid(
     browser: str, address: str
 ) -> None:
     """A phone that leaves the network gets no word of it for minutes."""
-
-    async def body(page: Tab) -> None:
+    async with look(browser, address) as page:
         await page.js("globalThis.first = lumiloop.link.socket; first.onmessage = null")
         for _ in range(3):
             await page.js("lumiloop.link.ping()")
@@ -234,13 +209,10 @@ def test_a_connection_that_answers_no_more_is_opened_again_and_orders_are_not_lo
         await page.until("lumiloop.link.socket && lumiloop.world.pose && lumiloop.world.pose.seq !== before")
         await page.until("document.getElementById('banner').hidden")
 
-    look(browser, address, body)
 
-
-def test_the_daemon_is_gone_and_the_page_says_so(browser: str, tmp_path: Path) -> None:
+async def test_the_daemon_is_gone_and_the_page_says_so(browser: str, tmp_path: Path) -> None:
     env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
-
-    async def body(address: str) -> None:
+    with view(env, tmp_path) as address:
         async with tab(browser, address) as page:
             await page.until("globalThis.lumiloop")
             await page.until("document.getElementById('banner').textContent.includes('start `lumiloop run`')")
@@ -257,14 +229,10 @@ def test_the_daemon_is_gone_and_the_page_says_so(browser: str, tmp_path: Path) -
             assert beside[0][0] <= 0
             assert beside[0][2] <= beside[1][1]
 
-    with view(env, tmp_path) as address:
-        asyncio.run(body(address))
 
-
-def test_a_recording_has_a_time_bar(browser: str, recording: Path, tmp_path: Path) -> None:
+async def test_a_recording_has_a_time_bar(browser: str, recording: Path, tmp_path: Path) -> None:
     with view(dict(os.environ), tmp_path, str(recording)) as address:
-
-        async def body(page: Tab) -> None:
+        async with look(browser, address) as page:
             await page.until("!document.getElementById('timebar').hidden")
             await page.until(
                 "Number(document.getElementById('seek').max) - Number(document.getElementById('seek').min) > 7"
@@ -277,5 +245,3 @@ def test_a_recording_has_a_time_bar(browser: str, recording: Path, tmp_path: Pat
             await page.click("#seek")  # its middle
             await page.until(f"lumiloop.world.pose && Math.abs(lumiloop.world.pose.t_mono - {before}) > 0.5")
             assert await page.js("document.getElementById('card-orders').hidden")
-
-        look(browser, address, body)

@@ -1,7 +1,5 @@
 """The page and its server where the connection between them is at fault: chromium, over a wire that can be cut."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import zlib

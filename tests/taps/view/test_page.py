@@ -1,12 +1,10 @@
 """What the page shows and can do, in a real browser, at the sizes of a desktop and a phone, dark and light."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import csv
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -63,25 +61,17 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield one
 
 
-def look(browser: str, folder: Path, body: Callable[[Tab], Awaitable[Any]], **options: Any) -> None:
-    """Run a body on the page of the room; the browser has nothing to complain of."""
-
-    @contextlib.asynccontextmanager
-    async def page() -> AsyncIterator[Tab]:
-        async with (
-            showing(folder) as house,
-            tab(browser, f"{house.address}/#token={TOKEN}", **{"size": DESKTOP, **options}) as one,
-        ):
-            await one.until(SHOWN)
-            await one.until("lumiloop.camera.scale !== 48 && document.querySelectorAll('.link').length > 4")
-            yield one
-
-    async def all_of_it() -> None:
-        async with page() as one:
-            await body(one)
-            assert one.said == []
-
-    asyncio.run(all_of_it())
+@contextlib.asynccontextmanager
+async def look(browser: str, folder: Path, **options: Any) -> AsyncIterator[Tab]:
+    """The page of the room; the browser has nothing to complain of."""
+    async with (
+        showing(folder) as house,
+        tab(browser, f"{house.address}/#token={TOKEN}", **{"size": DESKTOP, **options}) as one,
+    ):
+        await one.until(SHOWN)
+        await one.until("lumiloop.camera.scale !== 48 && document.querySelectorAll('.link').length > 4")
+        yield one
+        assert one.said == []
 
 
 async def text(page: Tab, selector: str) -> str:
@@ -110,8 +100,8 @@ async def show_faults(page: Tab, faults: list[dict[str, object]], t: float = 701
 
 @pytest.mark.parametrize("dark", [True, False])
 @pytest.mark.parametrize("size", [DESKTOP, PHONE])
-def test_every_text_can_be_read(browser: str, tmp_path: Path, size: tuple[int, int], dark: bool) -> None:
-    async def body(page: Tab) -> None:
+async def test_every_text_can_be_read(browser: str, tmp_path: Path, size: tuple[int, int], dark: bool) -> None:
+    async with look(browser, tmp_path, size=size, phone=size == PHONE, dark=dark) as page:
         await show_faults(page, FAULTS)
         await page.js(
             "for (const one of document.querySelectorAll('details')) one.open = true;"
@@ -134,11 +124,9 @@ def test_every_text_can_be_read(browser: str, tmp_path: Path, size: tuple[int, i
         wide = await page.js("[document.documentElement.scrollWidth, innerWidth]")
         assert wide[0] <= wide[1]
 
-    look(browser, tmp_path, body, size=size, phone=size == PHONE, dark=dark)
 
-
-def test_the_state_is_seen_at_once(browser: str, tmp_path: Path) -> None:
-    async def body(page: Tab) -> None:
+async def test_the_state_is_seen_at_once(browser: str, tmp_path: Path) -> None:
+    async with look(browser, tmp_path) as page:
         await page.until("document.title === 'TRACKING – agv-7 – lumiloop'")
         assert not await page.js("document.getElementById('card-cycle').open")
         listed = await text(page, "#legend")
@@ -154,11 +142,9 @@ def test_the_state_is_seen_at_once(browser: str, tmp_path: Path) -> None:
         await page.js("lumiloop.link.told.frame('daemon', {session: 1, up: false, why: 'the daemon has ended'})")
         await page.until("document.title.startsWith('NO DAEMON')")
 
-    look(browser, tmp_path, body)
 
-
-def test_on_a_phone_state_and_pose_come_first(browser: str, tmp_path: Path) -> None:
-    async def body(page: Tab) -> None:
+async def test_on_a_phone_state_and_pose_come_first(browser: str, tmp_path: Path) -> None:
+    async with look(browser, tmp_path, size=PHONE, phone=True) as page:
         top = {
             name: await page.js(f"document.getElementById({name!r}).getBoundingClientRect().top")
             for name in ("card-state", "card-pose", "stage", "card-orders")
@@ -171,13 +157,10 @@ def test_on_a_phone_state_and_pose_come_first(browser: str, tmp_path: Path) -> N
         tools = await page.js(f"{inside}(document.querySelector('.tools').getBoundingClientRect())")
         assert legend[1] <= tools[0]
 
-    look(browser, tmp_path, body, size=PHONE, phone=True)
 
-
-def test_the_view_is_where_the_robot_has_been(browser: str, tmp_path: Path) -> None:
+async def test_the_view_is_where_the_robot_has_been(browser: str, tmp_path: Path) -> None:
     """Through the glass the lidar sees, and maps, four times as much street as there is room."""
-
-    async def body(page: Tab) -> None:
+    async with look(browser, tmp_path) as page:
         x0, _, x1, _ = await page.js("lumiloop.camera.seen()")
         assert x0 < 0.0
         assert WIDTH < x1 < STREET - 10.0
@@ -185,11 +168,9 @@ def test_the_view_is_where_the_robot_has_been(browser: str, tmp_path: Path) -> N
         await press(page, "0")
         await page.until(f"lumiloop.camera.seen()[2] < {STREET - 10.0}")
 
-    look(browser, tmp_path, body)
 
-
-def test_relocalise_and_pause_ask_first(browser: str, tmp_path: Path) -> None:
-    async def body(page: Tab) -> None:
+async def test_relocalise_and_pause_ask_first(browser: str, tmp_path: Path) -> None:
+    async with look(browser, tmp_path) as page:
         for order, word in (("relocalise", "Relocalise"), ("pause", "Pause")):
             await page.click(f"[data-order={order}]")
             assert await page.js("document.getElementById('confirm').open")
@@ -201,11 +182,9 @@ def test_relocalise_and_pause_ask_first(browser: str, tmp_path: Path) -> None:
         await page.click("[data-order=save_map]")  # nothing is lost by this one
         await page.until("document.getElementById('told').textContent.includes('Save map')")
 
-    look(browser, tmp_path, body)
 
-
-def test_consequences_are_folded_below_their_cause(browser: str, tmp_path: Path) -> None:
-    async def body(page: Tab) -> None:
+async def test_consequences_are_folded_below_their_cause(browser: str, tmp_path: Path) -> None:
+    async with look(browser, tmp_path) as page:
         await show_faults(page, FAULTS)
         await page.until("document.querySelectorAll('#faults > li').length === 2")
         causes = await page.js(
@@ -223,11 +202,9 @@ def test_consequences_are_folded_below_their_cause(browser: str, tmp_path: Path)
         await show_faults(page, [{key: one[key] for key in ("fault", "meaning", "remedy")} for one in FAULTS], 703.0)
         await page.until("document.querySelectorAll('#faults > li').length >= 3")  # of a daemon that gives no causes
 
-    look(browser, tmp_path, body)
 
-
-def test_events_are_listed_with_their_times(browser: str, tmp_path: Path) -> None:
-    async def body(page: Tab) -> None:
+async def test_events_are_listed_with_their_times(browser: str, tmp_path: Path) -> None:
+    async with look(browser, tmp_path) as page:
         rows = (await text(page, "#events")).splitlines()
         states = [row for row in rows if row in ("MAPPING", "TRACKING", "DEGRADED")]
         assert states == ["TRACKING", "DEGRADED", "TRACKING", "MAPPING"]  # of before the page was opened; latest first
@@ -238,11 +215,9 @@ def test_events_are_listed_with_their_times(browser: str, tmp_path: Path) -> Non
         )
         assert 295.0 < apart < 305.0
 
-    look(browser, tmp_path, body)
 
-
-def test_plots_give_the_value_at_the_pointer(browser: str, tmp_path: Path) -> None:
-    async def body(page: Tab) -> None:
+async def test_plots_give_the_value_at_the_pointer(browser: str, tmp_path: Path) -> None:
+    async with look(browser, tmp_path) as page:
         await page.js("document.querySelector('.plot canvas').scrollIntoView({block: 'center'})")
         box = await page.js(
             "(({x, y, width, height}) => [x, y, width, height])"
@@ -259,11 +234,9 @@ def test_plots_give_the_value_at_the_pointer(browser: str, tmp_path: Path) -> No
         await point(page, box[0] - 300.0, box[1])
         await page.until("lumiloop.plots.cursor === null")
 
-    look(browser, tmp_path, body)
 
-
-def test_pointer_ruler_and_lamp(browser: str, tmp_path: Path) -> None:
-    async def body(page: Tab) -> None:
+async def test_pointer_ruler_and_lamp(browser: str, tmp_path: Path) -> None:
+    async with look(browser, tmp_path) as page:
         await point(page, *await screen_of(page, 1.0, 6.0))
         await page.until("document.getElementById('at').textContent === 'x 1.00, y 6.00 m'")
         lamp, code, x, y = LAMPS[2]
@@ -282,10 +255,8 @@ def test_pointer_ruler_and_lamp(browser: str, tmp_path: Path) -> None:
         await press(page, "?")
         assert "ruler" in await text(page, "#keys")
 
-    look(browser, tmp_path, body)
 
-
-def test_picture_and_values_are_saved(browser: str, tmp_path: Path) -> None:
+async def test_picture_and_values_are_saved(browser: str, tmp_path: Path) -> None:
     got = tmp_path / "got"
     got.mkdir()
 
@@ -296,7 +267,7 @@ def test_picture_and_values_are_saved(browser: str, tmp_path: Path) -> None:
             await asyncio.sleep(0.1)
         raise AssertionError(f"{pattern} has not arrived: {list(got.iterdir())}")
 
-    async def body(page: Tab) -> None:
+    async with look(browser, tmp_path) as page:
         await page.ask("Page.setDownloadBehavior", behavior="allow", downloadPath=str(got))
         await press(page, "s")
         with Image.open(await arrived("lumiloop-agv-7-*.png")) as image:
@@ -312,13 +283,10 @@ def test_picture_and_values_are_saved(browser: str, tmp_path: Path) -> None:
         await page.click("#events-csv")
         assert "TRACKING" in (await arrived("*-events.csv")).read_text()
 
-    look(browser, tmp_path, body)
 
-
-def test_a_page_of_a_robot_that_stands_rests(browser: str, tmp_path: Path) -> None:
+async def test_a_page_of_a_robot_that_stands_rests(browser: str, tmp_path: Path) -> None:
     """Without new data there is nothing to draw, but for the clock's sake once a second."""
-
-    async def body(page: Tab) -> None:
+    async with look(browser, tmp_path) as page:
         await page.js("lumiloop.link.take = () => {}")
         await asyncio.sleep(1.0)
         await page.js(
@@ -327,5 +295,3 @@ def test_a_page_of_a_robot_that_stands_rests(browser: str, tmp_path: Path) -> No
         )
         await asyncio.sleep(2.0)
         assert 1 <= await page.js("drawn") <= 8
-
-    look(browser, tmp_path, body)

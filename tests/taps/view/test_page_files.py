@@ -1,7 +1,5 @@
 """The page's own files: the contrasts of its colours by WCAG 2.2, and its size."""
 
-from __future__ import annotations
-
 import re
 from importlib import resources
 from typing import Final

@@ -1,7 +1,5 @@
 """A recording as a film: made of the daemon's own pipeline, shown from any instant."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 from importlib import resources

@@ -1,7 +1,5 @@
 """Where lamps hang and how the lidar sits: as the daemon that is watched has read it, not as an earlier one had."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from pathlib import Path
@@ -24,7 +22,7 @@ def begins_anew(house: House) -> None:
         client.drop()
 
 
-def test_a_daemon_that_begins_with_another_survey(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_daemon_that_begins_with_another_survey(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     found: list[Scene | SceneUnreadable] = [BEFORE]
 
     def again() -> Scene:
@@ -32,24 +30,21 @@ def test_a_daemon_that_begins_with_another_survey(tmp_path: Path, caplog: pytest
             raise found[-1]
         return found[-1]
 
-    async def body() -> None:
-        async with serving(tmp_path, scene=BEFORE, again=again) as house, house.page() as page:
-            assert (await page.welcome())["lamps"] == [[1, 5, 0.0, 0.0]]
-            await page.until("daemon", lambda told: told["up"])
-            found.append(AFTER)
-            begins_anew(house)
-            told = await page.until("scene")
-            assert (told["lamps"], told["mount"]) == ([[1, 5, 3.0, 4.0]], [0.1, 0.0, 90.0, False])
-            async with house.page() as other:
-                assert (await other.welcome())["lamps"] == [[1, 5, 3.0, 4.0]]
-            found.append(SceneUnreadable("lights.toml, line 3: lamp 7 twice"))
-            begins_anew(house)
-            await page.until("daemon", lambda told: told["up"])
-            async with house.page() as other:
-                assert (await other.welcome())["lamps"] == [[1, 5, 3.0, 4.0]]
-
     caplog.set_level(logging.WARNING)
-    asyncio.run(body())
+    async with serving(tmp_path, scene=BEFORE, again=again) as house, house.page() as page:
+        assert (await page.welcome())["lamps"] == [[1, 5, 0.0, 0.0]]
+        await page.until("daemon", lambda told: told["up"])
+        found.append(AFTER)
+        begins_anew(house)
+        told = await page.until("scene")
+        assert (told["lamps"], told["mount"]) == ([[1, 5, 3.0, 4.0]], [0.1, 0.0, 90.0, False])
+        async with house.page() as other:
+            assert (await other.welcome())["lamps"] == [[1, 5, 3.0, 4.0]]
+        found.append(SceneUnreadable("lights.toml, line 3: lamp 7 twice"))
+        begins_anew(house)
+        await page.until("daemon", lambda told: told["up"])
+        async with house.page() as other:
+            assert (await other.welcome())["lamps"] == [[1, 5, 3.0, 4.0]]
     assert "the previous lamps and mount are shown: lights.toml, line 3: lamp 7 twice" in caplog.text
 
 

@@ -1,7 +1,5 @@
 """The contracts with clients are those of the last release; a change that breaks a client is named."""
 
-from __future__ import annotations
-
 import copy
 import json
 from typing import Any

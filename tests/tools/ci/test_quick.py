@@ -1,7 +1,5 @@
 """`make quick`: the most specific tests of a change come first, and the run ends in time."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

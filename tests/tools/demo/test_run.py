@@ -1,10 +1,7 @@
 """The demo: its verdict, a run from end to end, an interrupted run, and a daemon that dies."""
 
-from __future__ import annotations
-
 import contextlib
 import json
-import math
 import os
 import re
 import signal
@@ -28,7 +25,7 @@ from tools.demo import run
 from tools.demo.acts import Stage, complaint, programme
 from tools.demo.folder import KEPT, Wiring, clear, note
 from tools.demo.run import Patience
-from tools.demo.score import Score, Track, in_map, summary, told, verdict
+from tools.demo.score import Score, Track, summary, told, verdict
 
 
 def reading(state: State = State.TRACKING, pose: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Any:
@@ -37,24 +34,6 @@ def reading(state: State = State.TRACKING, pose: tuple[float, float, float] | No
         "state": int(state), "map_x": x, "map_y": y, "map_yaw": yaw, "cycle": 0.001, "scan_rate": 40.0, "missed": 0,
         "overruns": 0, "t_mono": 1.0,
     }  # fmt: skip
-
-
-def test_truth_is_turned_into_the_map() -> None:
-    """The map's origin is where the robot truly stood at (1, 2) facing north; it has driven 3 m north since."""
-    seen = in_map((1.0, 5.0, math.pi / 2), (1.0, 2.0, math.pi / 2), (0.0, 0.0, 0.0))
-    assert seen == pytest.approx((3.0, 0.0, 0.0), abs=1e-12)
-
-
-def test_truth_is_interpolated_and_never_guessed() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        track = Track(sock)
-        track.poses.extend([(1.0, (0.0, 0.0, 3.1)), (2.0, (1.0, 2.0, -3.1))])
-        middle = track.at(1.5)
-        assert middle is not None
-        assert middle[:2] == (0.5, 1.0)
-        assert math.cos(middle[2]) == pytest.approx(-1.0)
-        assert track.at(0.9) is None
-        assert track.at(2.1) is None
 
 
 def test_the_way_counts_from_the_start_and_not_in_the_air() -> None:

@@ -1,7 +1,5 @@
 """The animation shows what was published, where the robot truly was, and when it was carried."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -38,25 +36,6 @@ def test_pose_truth_and_lamps_are_where_they_are_in_the_map() -> None:
     lost = frame(GROUND, [moment(State.RELOCATING, None)])
     assert lost.getpixel(pixel(1.0, -1.0)) != HUES[State.TRACKING]
     assert moment(State.TRACKING, (0.0, 2.0, 0.0)).off_m == pytest.approx(5.0)
-
-
-def test_a_trail_has_a_gap_where_the_pose_jumped() -> None:
-    path = [moment(State.TRACKING, (-4.0 + 0.1 * k, 4.0, 0.0), 0.1 * k) for k in range(10)]
-    path += [moment(State.TRACKING, (3.0 + 0.1 * k, 4.0, 0.0), 1.0 + 0.1 * k) for k in range(10)]
-    row = np.asarray(frame(GROUND, path))[pixel(0, 4.0)[1]].astype(int)
-    inked = np.ptp(row, axis=1) > 60
-    assert inked[pixel(-3.9, 0)[0] : pixel(-3.2, 0)[0]].all()
-    assert not inked[pixel(-2.9, 0)[0] : pixel(2.5, 0)[0]].any()
-
-
-def test_words_change_when_it_is_lifted_and_the_file_moves(tmp_path: Path) -> None:
-    both = [moment(State.TRACKING, (0.0, 0.0, 0.0)), moment(State.TRACKING, (0.0, 0.0, 0.0), 1.1, lifted=True)]
-    still, lifted = (np.asarray(frame(GROUND, [one]))[:HEAD] for one in both)
-    assert (still != lifted).any()
-    size = write(tmp_path / "a.gif", GROUND, both)
-    with Image.open(tmp_path / "a.gif") as picture:
-        assert picture.n_frames == 2  # type: ignore[attr-defined]
-    assert size == (tmp_path / "a.gif").stat().st_size
 
 
 def test_the_colours_of_the_states_survive_in_the_file(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """The example on the page about planning is what the command says."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

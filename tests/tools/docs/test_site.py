@@ -1,7 +1,5 @@
 """The documentation site builds without a warning and needs no network; its page of commands is current."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

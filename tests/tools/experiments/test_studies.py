@@ -1,7 +1,5 @@
 """Studies of one figure each: a bound worked out by hand, and the numbers they reach on real logs or a drive."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Odometry datagrams in virtual time, and the process from outside."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os

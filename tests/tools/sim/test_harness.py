@@ -1,7 +1,5 @@
 """The whole daemon in the simulated world in virtual time: bytes on a memory port, datagrams for the wheels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The whole daemon under coded lamps in virtual time: words on a memory bus, or decoded epochs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

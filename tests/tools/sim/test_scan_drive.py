@@ -1,7 +1,5 @@
 """Scans at the level of `step` are those that the fake sensor would have been given."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from estimator.measurements import Beam

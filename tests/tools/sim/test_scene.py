@@ -1,7 +1,5 @@
 """Scenes feed the fake lidar in the words of a sensor; a recorded log comes out bit for bit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

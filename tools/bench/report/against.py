@@ -1,7 +1,5 @@
 """A run of a bench against another one of the same bench: what has become worse, and what could be compared at all."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Collection, Sequence

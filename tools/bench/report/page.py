@@ -4,8 +4,6 @@ One report for all of them: the virtual bench, the suite on devices (tests/hil),
 world (tools/bench/world).
 """
 
-from __future__ import annotations
-
 import contextlib
 import html
 import json

@@ -1,7 +1,5 @@
 """Pictures for a report: what is to be drawn as plain data, and matplotlib's SVG of it."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass

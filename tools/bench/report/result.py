@@ -1,7 +1,5 @@
 """Results of a run on a bench: what was tried, its figures and pictures, and whose report it is."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

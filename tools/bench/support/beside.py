@@ -3,8 +3,6 @@
 python -m tools.bench.support.beside STREAM     connections that want every topic and read nothing, until killed
 """
 
-from __future__ import annotations
-
 import signal
 import socket
 import sys
@@ -15,6 +13,7 @@ from typing import Final, Protocol
 
 from daemon.publish.stream.server import TOPICS, framed
 from tools.bench.support.children import CannotRun, child, ended, lines, two_counts
+from tools.sim.ports import free_port
 
 READERS: Final = (sys.executable, "-m", "tools.bench.support.readers")
 VIEWERS: Final = (sys.executable, "-m", "tools.bench.support.viewers")
@@ -132,13 +131,6 @@ class Hanging:
 
 
 KINDS: Final[dict[str, Callable[[str, int], Beside]]] = {"readers": Readers, "browsers": Browsers, "hanging": Hanging}
-
-
-def free_port() -> int:
-    """A port that is free on loopback just now."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def hang(stream: str) -> None:

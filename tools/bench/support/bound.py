@@ -1,7 +1,5 @@
 """The Cramer-Rao bound of a scan's pose (Censi, ICRA 2007): what range noise lets anyone know, whatever the method."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tools.bench.support.scenes import Array, Scene

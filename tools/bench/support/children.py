@@ -1,7 +1,5 @@
 """Programs that a benchmark starts: each has to speak or to end within its time, and none outlives the benchmark."""
 
-from __future__ import annotations
-
 import os
 import select
 import signal

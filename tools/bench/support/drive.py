@@ -5,8 +5,6 @@ through the paper's room repeat the scans of the first one; light and odometry g
 included, so that neither decoder nor odometry ever meets a seam.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

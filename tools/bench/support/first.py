@@ -1,7 +1,5 @@
 """The calling thread before all other programs, as the daemon's loop is where a unit allows it."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 from collections.abc import Iterator

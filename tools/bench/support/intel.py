@@ -1,7 +1,5 @@
 """A CARMEN log for timing: scans in a row with what the wheels say of the way between them, and whole steps."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A clock that is put forward by hand, for cycles in simulated time."""
 
-from __future__ import annotations
-
 
 class ManualClock:
     """See :class:`hal.clock.Clock`; ``t`` is the monotonic time in s."""

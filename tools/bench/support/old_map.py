@@ -1,7 +1,5 @@
 """An old map of many submaps, of which a graph is to be solved."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Final
 

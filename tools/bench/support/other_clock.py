@@ -3,8 +3,6 @@
 On a busy computer a message is under way for long, and a robot at 0.6 m/s drives on 6 mm in 10 ms.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Final
 

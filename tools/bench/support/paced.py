@@ -10,8 +10,6 @@ for a while it runs *alone* and *loaded*: readers and a stuck client (the parent
 being solved without a pause (its own).
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import logging
@@ -47,6 +45,7 @@ from hal.timerfd import timer
 from tools.bench.support.drive import PERIOD_S, Delivery
 from tools.bench.support.first import first_in_line
 from tools.bench.support.old_map import SUBMAPS, old_map
+from tools.sim.ports import free_port
 
 SETTLE_S: Final = 8.0
 SHIFT_S: Final = 2e-4
@@ -277,7 +276,7 @@ async def go(wanted: Wanted, drive: Any) -> Told:
     lights = Lights(survey, PROFILE_A, 0.0)
     settings = Config(
         lidar=LidarConfig(device="/dev/bench", mount=Mount(x, y, float(np.degrees(yaw)))),
-        odometry=OdometryConfig(port=_free_port()),
+        odometry=OdometryConfig(port=free_port()),
         photodiode=PhotodiodeConfig(bus="/dev/bench-bus"),
         modbus=ModbusConfig(port=wanted.modbus),
         pose=PoseConfig(receivers=(wanted.receiver,)),
@@ -297,14 +296,6 @@ async def go(wanted: Wanted, drive: Any) -> Told:
         raise feeder.failure
     feeder.told.stalls, feeder.told.said = daemon.cycle.timing.latest.stalls, watch.said
     return feeder.told
-
-
-def _free_port() -> int:
-    import socket
-
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def main() -> None:

@@ -4,8 +4,6 @@ All get the points of two scans and a start, and do everything from there: norma
 forms: as its documentation has it, and as we found it most accurate, at whatever cost.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import version

@@ -5,8 +5,6 @@ They run until SIGTERM.
 Prints when it ends how many were asked and answered.
 """
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import struct

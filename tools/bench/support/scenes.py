@@ -1,7 +1,5 @@
 """Plain rooms to match in: walls as segments, columns as circles, and the ranges a lidar would measure in them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

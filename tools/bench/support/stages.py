@@ -1,7 +1,5 @@
 """Wall and processor time per stage of a cycle, taken by wrapping the functions that are the stages."""
 
-from __future__ import annotations
-
 import functools
 import resource
 import time

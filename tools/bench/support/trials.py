@@ -3,8 +3,6 @@
 Any matcher that is called as ``matcher(view, local, prior) -> MatchResult`` can be put on trial, see :func:`run`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial

@@ -4,8 +4,6 @@ python -m tools.bench.support.viewers serve STREAM PORT          as `lumiloop vi
 python -m tools.bench.support.viewers watch PORT COUNT           at SIGTERM it prints how many messages and bytes came
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

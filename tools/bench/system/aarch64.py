@@ -9,8 +9,6 @@ Needed: ``apt-get install qemu-user-static mmdebstrap``, root or user namespaces
 fetched stays in ~/.cache/lumiloop-aarch64 (600 MB); removing it is all there is to clean up.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.metadata
 import json

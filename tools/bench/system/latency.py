@@ -15,8 +15,6 @@ counts for neither.
 ``python -m tools.bench.system.latency --turns 30`` (16 minutes each).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -37,11 +35,12 @@ from daemon.devices.light_setup import Lights
 from daemon.runtime.warmup import load
 from daemon.system.realtime import PRIORITY
 from estimator.cdma.air_interface import PROFILE_A
-from tools.bench.support.beside import BROWSERS, KINDS, Beside, Readers, free_port
+from tools.bench.support.beside import BROWSERS, KINDS, Beside, Readers
 from tools.bench.support.children import CannotRun, child, ended, finished, lines
 from tools.bench.support.drive import PERIOD_S, EndlessDrive
 from tools.bench.support.paced import SETTLE_S
 from tools.ci.figures import Figure, bounded, save, table
+from tools.sim.ports import free_port
 
 COMMAND: Final = "python -m tools.bench.system.latency"
 STRETCH_S: Final = 10.0

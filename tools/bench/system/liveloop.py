@@ -7,8 +7,6 @@ which moves the pose by 8 cm; the clock runs from the cycle that takes this answ
 ``T_map_odom`` has changed. How long cycles take is compared between the two.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import os

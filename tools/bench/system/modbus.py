@@ -1,7 +1,5 @@
 """The Modbus server against pymodbus's own server: both in one process, asked in turns by one plain-socket client."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import json
@@ -26,6 +24,7 @@ from daemon.snapshot import Snapshot, State
 from hal.clock import SystemClock
 from tools.bench.support.children import child, ended, lines
 from tools.ci.figures import Figure, bounded, table
+from tools.sim.ports import free_port
 
 COMMAND: Final = "python -m tools.bench.system.modbus"
 PEER: Final = f"pymodbus {pymodbus.__version__} server"
@@ -79,13 +78,6 @@ async def serve() -> None:
     for server in servers:
         await server.shutdown()
     await asyncio.gather(*running, return_exceptions=True)
-
-
-def free_port() -> int:
-    """A port that is free on TCP (pymodbus does not tell which one it got)."""
-    with socket.socket() as sock:
-        sock.bind((_HOST, 0))
-        return int(sock.getsockname()[1])
 
 
 @contextmanager

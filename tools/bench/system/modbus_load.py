@@ -4,8 +4,6 @@ The server has a process of its own with a tick of 3 ms work 40 times a second, 
 as the daemon's loop has it; how late its ticks begin is measured in turns without and with a flood.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import gc

@@ -4,8 +4,6 @@ The same daemon on the same fake UTM-30LX (1081 beams at 40 Hz), with and withou
 on a shared machine changes by more than what is sought. All threads count.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import statistics

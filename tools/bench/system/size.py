@@ -4,8 +4,6 @@ The extras are those of `pyproject.toml` that a robot runs; what draws, compares
 those of `requirements/dev.lock`. Everything goes below a temporary folder; packages come from the index that pip has.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

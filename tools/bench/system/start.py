@@ -1,7 +1,5 @@
 """From process start to the first published pose with warm caches, and the memory it takes."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

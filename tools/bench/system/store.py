@@ -5,8 +5,6 @@ covers 2000 m2 and more, each copy with keys of its own, as floors of a building
 100 Hz is measured with and without a save going on in the keeper's thread.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import tempfile

@@ -4,8 +4,6 @@ Ends with 0 if every scenario passed, 1 if one did not or was not run, 2 if this
 what is missing).
 """
 
-from __future__ import annotations
-
 import argparse
 import signal
 import sys
@@ -20,7 +18,6 @@ from tools.bench.vm.common import Scenario
 from tools.bench.vm.guests import Guest, run_all
 from tools.bench.vm.image import image
 from tools.bench.vm.places import CannotBench, workspace
-from tools.bench.vm.reference import outside
 from tools.bench.vm.scenarios import SCENARIOS, SHARES
 
 ROOM = 4_000_000_000
@@ -80,7 +77,6 @@ def main() -> int:
         demand_apart(options.out, before)
         with image(say) as system:
             made = booted(system, say)
-            outside()
             if options.image_only:
                 return 0
             whole, results = run(made, shares, options.out)

@@ -1,7 +1,5 @@
 """What a scenario has at hand: the emulated computer, the world around it, and the daemon as others see it."""
 
-from __future__ import annotations
-
 import json
 import math
 import select
@@ -23,9 +21,10 @@ from tools.bench.support.children import LEASH
 from tools.bench.support.other_clock import OtherClock
 from tools.bench.vm.booted import Booted
 from tools.bench.vm.image import ROOT
-from tools.bench.vm.machine import OUTSIDE, Machine, Order, Ports, free_for_both, free_port, started
+from tools.bench.vm.machine import OUTSIDE, Machine, Order, Ports, started
 from tools.bench.vm.places import CannotBench
 from tools.clients.read_modbus import Reader
+from tools.sim.ports import free_port
 from tools.sim.robot.truth import Pose, at_time, in_map
 
 UNIT: Final = "lumiloop.service"
@@ -299,10 +298,10 @@ def bench(booted: Booted, folder: Path, broken_off: threading.Event, nice: int =
         truth, poses = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
         for one in (truth, poses):
             one.bind(("127.0.0.1", 0))
-        odometry = free_port(socket.SOCK_DGRAM)
+        odometry = free_port()
         world, there = _start_world(folder, odometry, truth.getsockname()[1], stack)
         there["poses"] = poses.getsockname()[1]
-        ports = Ports(free_for_both(), odometry, int(there["lidar"]))
+        ports = Ports(free_port(), odometry, int(there["lidar"]))
         machine = stack.enter_context(started(booted.start, folder, ports, broken_off, nice))
         made = Bench(machine, world, folder, there)
         made.booted_s = booted.seconds

@@ -5,8 +5,6 @@ held, and its memory and what it has written to its disk are kept (QEMU's migrat
 each run: the reboot and the power cut. What is kept fits one QEMU and one command line only, which its name tells.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -18,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from tools.bench.vm import whole
 from tools.bench.vm.image import Image, Say
-from tools.bench.vm.machine import Order, Ports, Start, all_well, command_line, free_for_both, free_port, started
-from tools.bench.vm.places import CannotBench, clear, remedy, workspace
+from tools.bench.vm.machine import Order, Ports, Start, all_well, command_line, started
+from tools.bench.vm.places import CannotBench, clear, missing_of, remedy, workspace
+from tools.sim.ports import free_port
 
 ROOM: Final = 2_000_000_000
 QEMU: Final = "qemu-system-x86_64"
@@ -57,8 +55,8 @@ class Booted:
         return float(json.loads((self.folder / "told.json").read_text())["seconds"])
 
     def lacks(self) -> str:
-        """What is missing or other than it was kept; empty text: it is whole."""
-        return whole.lacks(self.folder, self.parts)
+        """What is missing or empty; empty text: it is whole."""
+        return missing_of(self.parts)
 
     @property
     def parts(self) -> tuple[Path, ...]:
@@ -89,7 +87,6 @@ def booted(image: Image, say: Say) -> Booted:
             part.mkdir()
             seconds = _boot(folder, Booted(image, part))
         (part / "told.json").write_text(json.dumps({"seconds": seconds}))
-        whole.note(part, Booted(image, part).parts)
         part.replace(made.folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -102,7 +99,7 @@ def _boot(folder: Path, made: Booted) -> float:
     done = subprocess.run(disk, capture_output=True, text=True)
     if done.returncode:
         raise CannotBench(f"making room for what the first boot writes failed: {done.stderr}")
-    ports = Ports(free_for_both(), free_port(), free_port())
+    ports = Ports(free_port(), free_port(), free_port())
     with started(Start(made.image, made.disk, keep=True), folder, ports, threading.Event()) as machine:
         begun = time.monotonic()
         try:

@@ -1,7 +1,5 @@
 """What scenarios share: how they are told apart from other functions, and what several of them do and ask."""
 
-from __future__ import annotations
-
 import math
 import struct
 import time
@@ -19,8 +17,6 @@ Daemon = Literal["same", "anew", "restarted", "gone"]
 AFTER: Final[dict[Scenario, Daemon]] = {}
 """What the daemon is after each: the same process as before; one that a person or the computer's start has started,
 and which has lived since; one that the service manager has restarted once; none."""
-ALONE: Final[set[Scenario]] = set()
-"""Those during which the others wait between two scenarios of theirs, where the emulation is slow."""
 TRACKING_S: Final = 60.0
 WORST_M: Final = 0.10
 RESTING_M: Final = 0.05
@@ -36,18 +32,15 @@ reckoned from that (docs/bench.md)."""
 
 
 BUDGET: Final = "[cycle]\nbudget_ms = 150.0"
-"""Of a scan period of 200 ms, for the drive that is compared, and for a robot that looks for its place on the way: with
-the usual half of it a loaded computer would leave work undone, and the drive would be another one than outside."""
+"""Of a scan period of 200 ms: with the usual half of it a loaded computer would leave work undone."""
 
 
-def scenario(daemon: Daemon = "same", alone: bool = False) -> Callable[[Scenario], Scenario]:
-    """A decorator: it is one of the list, and leaves the daemon so; ``alone``: see :data:`ALONE`."""
+def scenario(daemon: Daemon = "same") -> Callable[[Scenario], Scenario]:
+    """A decorator: it is one of the list, and leaves the daemon so."""
 
     def kept(function: Scenario) -> Scenario:
         WRITTEN.append(function)
         AFTER[function] = daemon
-        if alone:
-            ALONE.add(function)
         return function
 
     return kept

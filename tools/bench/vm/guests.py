@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -17,14 +16,13 @@ from typing import Final
 from tools.bench.report.result import Figure, Result, Seen
 from tools.bench.vm.bench import Bench, bench
 from tools.bench.vm.booted import Booted
-from tools.bench.vm.common import AFTER, ALONE, Scenario, Unmet, unnoticed
+from tools.bench.vm.common import AFTER, Scenario, Unmet, unnoticed
 from tools.bench.vm.machine import Order
 from tools.bench.vm.places import BrokenOff, CannotBench
 
 JOURNAL: Final = ("journalctl", "--no-pager", "-o", "short-monotonic", "-n", "3000")
 BEHIND: Final = {2: 5, 3: 2}
-"""Which computer stands back (nice(1)): the first one's drive is compared with one outside, to a centimetre; the third
-one has most to do."""
+"""Which computer stands back (nice(1)): the first one drives; the third one has most to do."""
 LONGEST: Final = 3
 """The computer that has most to do is the first to be switched on."""
 SIDE_BY_SIDE: Final = 2
@@ -32,7 +30,6 @@ SIDE_BY_SIDE: Final = 2
 SLOW: Final = 2.5
 """From so many times the usual seconds for the same work. At 2.3 three side by side were all right."""
 LOOK_S: Final = 0.1
-PATIENCE_S: Final = 300.0
 Say = Callable[[str], None]
 
 
@@ -91,46 +88,6 @@ def _with_work(scenario: Scenario, whole: Bench) -> Result:
     return replace(one, figures=(*one.figures, Figure("work of the emulation", after - before, "CPU s")))
 
 
-class Turns:
-    """Who tries a scenario: several at once, or one that wants the others to wait.
-
-    They wait between two scenarios, where nothing is asked of their daemons; these and their worlds go on running. Who
-    wants it waits until they have ended theirs, but not for ever: one that comes to no end costs it `PATIENCE_S`.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Condition()
-        self._running = 0
-        self._alone = False
-
-    @contextmanager
-    def taken(self, alone: bool, broken_off: threading.Event) -> Iterator[None]:
-        """A turn; raises `BrokenOff` instead where the run is to end."""
-        with self._lock:
-            self._wait(lambda: not self._alone, broken_off)
-            self._alone = alone
-            try:
-                self._wait(lambda: not (alone and self._running), broken_off, PATIENCE_S)
-            except BrokenOff:
-                self._alone = False
-                self._lock.notify_all()
-                raise
-            self._running += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._running -= 1
-                self._alone = self._alone and not alone
-                self._lock.notify_all()
-
-    def _wait(self, free: Callable[[], bool], broken_off: threading.Event, patience_s: float = math.inf) -> None:
-        begun = time.monotonic()
-        while not self._lock.wait_for(free, LOOK_S) and time.monotonic() - begun < patience_s:
-            if broken_off.is_set():
-                raise BrokenOff
-
-
 @dataclass(slots=True)
 class Guest:
     """One emulated computer, its share, and what has come of it so far.
@@ -144,22 +101,20 @@ class Guest:
     slower: float | None = None
     broken_off: threading.Event = field(default_factory=threading.Event)
 
-    def run(self, booted: Booted, folder: Path, out: Path, say: Say, turns: Turns) -> None:
+    def run(self, booted: Booted, folder: Path, out: Path, say: Say) -> None:
         """Try them, until it ends or is broken off; its console, its journal and its drive stay in ``out``."""
         why = "the bench has met an error of its own, which it has written"
         try:
             folder.mkdir()
             with ExitStack() as stack:
-                with turns.taken(False, self.broken_off):
-                    nice = BEHIND.get(self.number, 0)
-                    whole = stack.enter_context(bench(booted, folder, self.broken_off, nice))
+                nice = BEHIND.get(self.number, 0)
+                whole = stack.enter_context(bench(booted, folder, self.broken_off, nice))
                 for scenario in self.share:
-                    alone = scenario in ALONE and self.slower is not None and self.slower > SLOW
-                    with turns.taken(alone, self.broken_off):
-                        self.results.append(_with_work(scenario, whole))
+                    whole.machine.check()
+                    self.results.append(_with_work(scenario, whole))
                     self._tell(self.results[-1], say)
                     self.slower = whole.slower
-                with turns.taken(False, self.broken_off), contextlib.suppress(Order, OSError):
+                with contextlib.suppress(Order, OSError):
                     (out / f"journal-{self.number}.log").write_text(whole.machine.run(*JOURNAL, seconds=120))
         except BrokenOff:
             why = "the run was broken off"
@@ -190,7 +145,7 @@ def run_all(guests: list[Guest], booted: Booted, folder: Path, out: Path, say: S
     Where the emulation is found to be slow, no more than `SIDE_BY_SIDE` run at once: what a computer leaves undone for
     want of its processor would be told of the daemon in it.
     """
-    broken_off, turns = threading.Event(), Turns()
+    broken_off = threading.Event()
 
     def break_off(number: int, frame: object) -> None:
         for one in before:  # a second one in the middle of this would wait for ever for what the first one holds
@@ -206,7 +161,7 @@ def run_all(guests: list[Guest], booted: Booted, folder: Path, out: Path, say: S
         threads: list[threading.Thread] = []
         for one in sorted(guests, key=lambda one: one.number != LONGEST):
             _wait_for_room(guests, threads, say)
-            words = (booted, folder / str(one.number), out, say, turns)
+            words = (booted, folder / str(one.number), out, say)
             threads.append(threading.Thread(target=one.run, args=words))
             threads[-1].start()
         for thread in threads:

@@ -5,8 +5,6 @@ base with the package of these sources and its kernels compiled for any processo
 others see: the file system is made from a folder.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json
@@ -22,8 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tools.bench.support.children import LEASH
-from tools.bench.vm import whole
-from tools.bench.vm.places import CannotBench, cache, clear, discard, held, missing, workspace
+from tools.bench.vm.places import CannotBench, cache, clear, discard, held, missing, missing_of, workspace
 
 ROOT = Path(__file__).parents[3]
 GUEST = Path(__file__).parent / "guest"
@@ -83,8 +80,8 @@ class Image:
         return self.folder / "initrd"
 
     def lacks(self) -> str:
-        """What is missing or other than it was made; empty text: it is whole."""
-        return whole.lacks(self.folder, self.parts)
+        """What is missing or empty; empty text: it is whole."""
+        return missing_of(self.parts)
 
     @property
     def parts(self) -> tuple[Path, ...]:
@@ -268,7 +265,6 @@ def _make_image(folder: Path, made: Image, say: Say) -> None:
             disk.truncate(DISK_BYTES)
         path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
         _do(["mkfs.ext4", "-q", "-F", "-d", str(root), str(part / "disk")], "making the disk", {"PATH": path})
-        whole.note(part, Image(part).parts)
         part.replace(made.folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -332,14 +328,12 @@ def copy_kernels(compiled: Path, place: Path) -> None:
 
 
 def _compile(say: Say) -> Path:
-    """Compile the kernels for any processor, and for this one by the drive outside; the folder of the former."""
+    """Compile the kernels for any processor; returns their folder."""
     say("compiling kernels for any processor")
     warm = [sys.executable, "-m", "daemon", "warm", "--config", str(GUEST / "lumiloop.toml")]
     _do([*warm, "--set", "photodiode.bus=adapter:bench"], "compiling kernels", WARM)
     where = "from estimator.numerics.jit_cache import CACHE_DIR; print(CACHE_DIR)"
-    compiled = Path(_do([sys.executable, "-c", where], "finding the kernels", WARM).split()[-1])
-    _do([sys.executable, "-m", "tools.bench.vm.reference"], "driving outside", {"PYTHONPATH": str(ROOT)})
-    return compiled
+    return Path(_do([sys.executable, "-c", where], "finding the kernels", WARM).split()[-1])
 
 
 def plant(root: Path, compiled: Path) -> None:

@@ -1,7 +1,5 @@
 """The emulated computer: QEMU with the image's kernel and disk, its network, its two wires, and its reset button."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -48,26 +46,6 @@ PROCESSOR = "Nehalem"
 """The oldest that everything inside runs on (numpy wants x86-64-v2): wide vectors are the dearest to emulate."""
 OUTSIDE = "10.0.2.2"
 """This computer, as the emulated one sees it."""
-
-
-def free_port(kind: int = socket.SOCK_STREAM) -> int:
-    """A port of the loopback address that nobody has taken."""
-    with socket.socket(socket.AF_INET, kind) as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
-
-
-def free_for_both() -> int:
-    """A port that is free for TCP and UDP."""
-    for _ in range(20):
-        port = free_port()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-            try:
-                one.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return port
-    raise CannotBench("no port of the loopback address is free for TCP and UDP")
 
 
 @dataclass(frozen=True, slots=True)

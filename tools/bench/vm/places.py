@@ -1,14 +1,12 @@
 """Where the bench works and keeps things, and what a machine must have for it."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -78,6 +76,11 @@ def remedy(folder: Path) -> str:
         f"remove {folder} as its owner or as root, then it is made anew; XDG_CACHE_HOME can name another place for "
         "what is kept"
     )
+
+
+def missing_of(parts: Sequence[Path]) -> str:
+    """Which of these files are missing or empty; empty text: none."""
+    return ", ".join(f"no {part.name}" for part in parts if not part.is_file() or not part.stat().st_size)
 
 
 def clear(folder: Path, lacks: str) -> None:

@@ -7,8 +7,6 @@ A scenario's first line is its title in the report; what it returns is what was 
 some twenty times slower than the machine around it, so they are reported and bounded only as far as they must be.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 from tools.bench.vm import (

@@ -1,7 +1,5 @@
 """Scenarios: a computer whose robot stands, a process that does nothing any more, power, and boots."""
 
-from __future__ import annotations
-
 import re
 import time
 from typing import Final

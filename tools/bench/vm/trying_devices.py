@@ -1,6 +1,4 @@
-"""Scenarios: the lidar comes, goes and errs, on a real serial port."""
-
-from __future__ import annotations
+"""Scenarios: the lidar goes and comes, on a real serial port."""
 
 import time
 from typing import Final
@@ -50,31 +48,3 @@ def comes_back_under_another_name(bench: Bench) -> str:
 
 def _lidar_node(bench: Bench) -> str:
     return bench.machine.run("readlink", "-f", "/dev/lumiloop/lidar", check=False)
-
-
-@scenario()
-def falls_silent(bench: Bench) -> str:
-    """The lidar says nothing for six seconds, its cable in place."""
-    pid = bench.main_pid()
-    bench.orders("order silence where=lidar for=6")
-    seconds = bench.until("silence shown", 5.0, lambda: bench.read().get("state") in ("NO_LIDAR", "DEGRADED"))
-    bench.fault(104, 101)
-    return f"shown after {seconds:.1f} s; {back(bench, pid)}"
-
-
-@scenario()
-def is_switched_off(bench: Bench) -> str:
-    """The lidar loses its power for four seconds and starts up again."""
-    pid = bench.main_pid()
-    bench.orders("order off where=lidar for=4")
-    bench.fault(104, 101)
-    return back(bench, pid)
-
-
-@scenario()
-def talks_garbage(bench: Bench) -> str:
-    """Every second scan is random bytes for five seconds."""
-    pid = bench.main_pid()
-    bench.orders("order garbage where=lidar on=scans share=0.5 for=5")
-    bench.wait(5.0)
-    return back(bench, pid)

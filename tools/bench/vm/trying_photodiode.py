@@ -5,8 +5,6 @@ blocks late or lost, and says so (faults 156, 157, 163, 165, which come and go w
 what is tried is the way of the samples, and of the faults that only the bus can tell, not the light.
 """
 
-from __future__ import annotations
-
 import struct
 import time
 from typing import Final

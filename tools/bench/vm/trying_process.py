@@ -1,7 +1,5 @@
 """Scenarios: what happens to the process while its robot drives."""
 
-from __future__ import annotations
-
 import time
 from typing import Final
 

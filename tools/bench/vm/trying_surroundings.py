@@ -1,7 +1,5 @@
 """Scenarios: what happens around the process, to the clock and to the disk."""
 
-from __future__ import annotations
-
 from tools.bench.vm.bench import DONE, REFUSED, SAVE_MAP, Bench
 from tools.bench.vm.common import back, need, scenario
 

@@ -1,15 +1,10 @@
 """Scenarios: the system comes up with the service in it, and others see its pose."""
 
-from __future__ import annotations
-
 import json
 import re
 import statistics
 import time
-from dataclasses import replace
 from typing import Final
-
-import numpy as np
 
 from tools.bench.report.plots import Plot, Series, histogram
 from tools.bench.report.result import Figure, Seen
@@ -28,16 +23,13 @@ from tools.bench.vm.common import (
     start,
 )
 from tools.bench.vm.machine import Order
-from tools.bench.vm.reference import DRIVE_S, outside
 from tools.bench.world.room import LIDAR
 from tools.sim.robot.truth import in_map
 
+DRIVE_S: Final = 30.0
 FIFO: Final = 1
 MARKS: Final = "/var/cache/private/lumiloop/kernels-*/warm-*"
 """They say that an earlier start has compiled the kernels."""
-AGREE_M: Final = 0.01
-AGREE_WAY_M: Final = 4.0
-"""Driven at least: two runs that share no way agree about nothing."""
 ASKED: Final = 50
 LOST_UDP: Final = 1
 """A datagram that nobody repeats may be lost in the emulated network, and its loss is no fault of the daemon; what is
@@ -45,16 +37,6 @@ sent over TCP may not."""
 MOST: Final = 0.9
 """Of the scans: at the ends of the time that is listened, one more or less may fall into it. So much of a drive is
 TRACKING, too."""
-LATE_S: Final = 0.02
-SPREAD_MS: Final = 20
-"""By so much lateness may change in a drive: 4 mm to either side at 0.4 m/s, which is what it may hide."""
-SLOWEST: Final = 2.5
-"""So many times more lateness is allowed at most where the emulation is slower."""
-EARLY_S: Final = 0.02
-"""Two computers' clocks are put together by the datagram that was under way the shortest, which may be too near: a run
-was 7 to 19 ms early, others on that day 11 to 25 ms late."""
-LATER: Final = 1e-3 * np.array(sorted(range(-30, round(1e3 * (SLOWEST + 0.5) * LATE_S)), key=abs), np.float64)
-"""The nearest to none first, which is what is said where nothing tells."""
 
 
 # the system as it comes up
@@ -175,13 +157,12 @@ def begins_where_it_stands(bench: Bench) -> str:
     return f"{1e3 * begin(bench):.0f} mm at most"
 
 
-@scenario(alone=True)
+@scenario()
 def drives(bench: Bench) -> Seen:
     """Half a minute at 0.4 m/s: TRACKING, never further from the truth than 10 cm and three of its own sigma."""
     bench.drive()
     bench.until("the robot sets off", 30.0, lambda: abs(_true_speed(bench)) > 0.1)
     heard = bench.collect(DRIVE_S)
-    bench.memory["drive"] = heard
     found = errors(bench, heard)
     need(found, "no pose has come")
     _keep(bench, heard)
@@ -213,54 +194,6 @@ def _keep(bench: Bench, heard: list[Heard]) -> None:
         "poses: came, true at, (x, y, yaw), missed scans, cycles over budget, fault; truth: at, (x, y, yaw); s, m, rad"
     )
     (bench.folder / "drive").write_text(json.dumps({"what": head, "poses": poses, "truth": truth}))
-
-
-@scenario()
-def agrees_with_outside(bench: Bench) -> Seen:
-    """The same drive outside, in virtual time: but for lateness, poses agree to 1 cm until a loop is closed."""
-    drive = bench.memory["drive"]
-    seen, agree = _compared(bench, drive)
-    # a drive without some scans or map work is another one: the two must agree until the emulated processor left it
-    undone = next((k for k, one in enumerate(drive) if _work_left(drive[0], one) != (0, 0)), None)
-    if not agree and undone is not None:
-        whole = replace(seen.figures[-2], name="inside and outside: apart, largest of the whole drive")
-        part, agree = _compared(bench, drive[:undone])
-        said = f"{part.said}, until work was left undone ({_trouble(drive)})"
-        plots = tuple(replace(plot, title=f"{plot.title}, whole drive") for plot in seen.plots)
-        seen = Seen(said, (*part.figures, whole), (*part.plots, *plots))
-    if not agree:
-        raise Unmet("; ".join([seen.said, *map(str, seen.figures), _trouble(drive)]), seen)
-    return seen
-
-
-def _compared(bench: Bench, drive: list[Heard]) -> tuple[Seen, bool]:
-    """A drive, or its beginning, beside the one outside; whether they agree."""
-    from tools.bench.world.agreement import figures as apart  # here: with it comes the estimator, which takes long
-    from tools.bench.world.agreement import lateness, trace_of
-
-    placed = [one for one in drive if one.pose is not None and one.loops == drive[0].loops]
-    need(placed, "no pose of the drive claims a place before a loop is closed")
-    told = list(bench.ears.truth)
-    t, poses = np.array([one.t_pose for one in placed]), np.array([one.pose for one in placed])
-    truth_t, truth = np.array([t for t, _ in told]), np.array([pose for _, pose in told])
-    late = lateness(LATER, lambda part, by: trace_of(t[part] - by, poses[part], truth_t, truth), len(t), outside())
-    figures, plots = apart(trace_of(t - late, poses, truth_t, truth), outside(), "inside and outside")
-    spread = Figure("inside: lateness changes by", 1e3 * float(np.ptp(late)), "ms", "more", 0.5, 5.0)
-    most = float(late[np.argmax(np.abs(late))])
-    figures = (Figure("inside: late by", 1e3 * most, "ms", "more", 0.5, 5.0), *figures, spread)
-    way = figures[1].value
-    seen = Seen(f"{len(placed)} poses", figures, plots)
-    largest = _largest(seen)
-    most_late = LATE_S * min(max(1.0, bench.slower), SLOWEST)
-    steady = round(1e3 * float(np.ptp(late))) <= SPREAD_MS
-    in_time = late.min() >= -EARLY_S and late.max() <= most_late
-    agree = in_time and steady and way >= AGREE_WAY_M and largest <= 1e3 * AGREE_M
-    return seen, bool(agree)
-
-
-def _largest(seen: Seen) -> float:
-    """How far the two were apart at most, mm."""
-    return float(next(one.value for one in seen.figures if one.name.endswith("apart, largest")))
 
 
 def _work_left(first: Heard, one: Heard) -> tuple[int, int]:

@@ -6,8 +6,6 @@ a pause before each. The lamps over it are ordinary ones: looking for others' co
 enough.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import secrets
@@ -42,7 +40,7 @@ ROBOT = Body(speed=0.4, turn_rate=0.6)
 
 
 def scenario() -> Scenario:
-    """What is driven; also outside of the emulated computer, to compare with."""
+    """What is driven."""
     return Scenario(lidar=LIDAR, people=False, dwell_s=DWELL_S, body=ROBOT, wheels=Wheels(rate_hz=WHEELS_HZ))
 
 

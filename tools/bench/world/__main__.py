@@ -10,8 +10,6 @@ The same words and ``--write-config DIR`` write what the robot computer needs fo
 Ends with 0 if everything is as expected, 1 if not, 2 if it cannot be played.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import signal

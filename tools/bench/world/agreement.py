@@ -1,15 +1,12 @@
 """Whether two runs of one scenario said the same: as the robot got along, where was it put?
 
-The same drive inside the emulated computer and outside of it, or on a robot's computer and in virtual time: the truth
-is the same, so what differs is what was published. Scans do not fall on the same instants, so the errors are compared,
+The same drive twice on a robot's computer, or there and in virtual time: the truth is the same, so what differs is
+what was published. Scans do not fall on the same instants, so the errors are compared,
 which change slowly, at equal ways driven. When the first loop is closed the whole map moves by what that loop is good
 for, which is centimetres, and with which keyframe it is closed depends on the scans: until then two runs say the same.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,15 +18,10 @@ from tools.bench.report.result import Figure
 from tools.bench.world.judge import Errors, Played, errors_of
 from tools.bench.world.scenario import Scenario
 from tools.sim.harness import run
-from tools.sim.robot.truth import in_map
-from tools.sim.scene import SimulatedScene
 
 Array = npt.NDArray[np.float64]
 STEP_M: Final = 0.05
 FINE_S: Final = 0.02
-GROUP: Final = 25
-"""Stamps that are late by the same."""
-LEAST_M: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,14 +40,6 @@ def trace(played: Played) -> Trace:
     return _trace(errors_of(played), seconds, played.truth(seconds))
 
 
-def trace_of(t: Array, poses: Array, truth_t: Array, truth: Array) -> Trace:
-    """Of poses in a map that begins where the robot truly is first, and of the truth in a frame of its own."""
-    start, t0 = truth[0], truth_t[0]
-    true = np.column_stack([np.interp(t, truth_t, truth[:, k]) for k in range(2)] + [np.zeros(len(t))])
-    off = poses - in_map(true, start, np.zeros(3))
-    return _trace(Errors(t - t0, off, poses, np.zeros(len(t))), truth_t - t0, truth)
-
-
 def _trace(found: Errors, seconds: Array, truth: Array) -> Trace:
     driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
     inside = (found.t >= seconds[0]) & (found.t <= seconds[-1])
@@ -68,13 +52,9 @@ def alike_s(scenario: Scenario) -> float:
 
 
 def reference(scenario: Scenario) -> Trace:
-    """The same scenario with the daemon in this process and in virtual time, until the first fault."""
-    return reference_of(scenario.scene(held=False), alike_s(scenario), scenario.world.odometry)
-
-
-def reference_of(scene: SimulatedScene, seconds: float, odometry: bool = True) -> Trace:
-    """A scene in virtual time, for so many seconds from its first scan, until it closes a loop."""
-    made = run(seconds, scene=scene, odometry=odometry)
+    """The same scenario with the daemon in this process and in virtual time, until its first fault or loop."""
+    scene, seconds = scenario.scene(held=False), alike_s(scenario)
+    made = run(seconds, scene=scene, odometry=scenario.world.odometry)
     t0 = float(scene.t_go or 0.0)
     kept = np.isfinite(made.pose[:, 0])
     off = made.pose[kept] - made.truth[kept]
@@ -95,34 +75,6 @@ def differences(one: Trace, other: Trace) -> tuple[Array, Array]:
 def _at(one: Trace, driven: Array, axis: int) -> Array:
     order = np.argsort(one.driven, kind="stable")
     return np.asarray(np.interp(driven, one.driven[order], one.off[order, axis]))
-
-
-def lateness(tried: Array, traced: Callable[[slice, Array], Trace], count: int, other: Trace) -> Array:
-    """By how many seconds each of ``count`` stamps has to be set back for two traces to say most nearly the same.
-
-    A line on which every scan is under way for a while, the emulated computer's, makes all instants later by as much:
-    at 0.4 m/s 10 ms are 4 mm along the way, which are the line's and not what was made of the scans. How much it is
-    changes with what else the computer around has to do, in seconds and not from scan to scan: stamps are set back in
-    groups. One in which less than half a metre was driven tells nothing, and has what the one before had. An error
-    along the way that changes from group to group looks like it: who judges bounds by how much groups may differ.
-
-    Args:
-        tried: seconds; of several that do equally well the first is taken.
-        traced: the trace of some of the stamps, each set back by so much.
-        count: of stamps.
-        other: the trace to agree with.
-    """
-    late, before = np.full(count, math.nan), math.nan
-    for first in range(0, count, GROUP):
-        part = slice(first, first + GROUP if count - first >= 2 * GROUP else count)
-        gaps = [differences(traced(part, np.full(len(late[part]), by)), other)[1] for by in tried.tolist()]
-        if min(map(len, gaps)) * STEP_M >= LEAST_M:
-            before = float(tried[int(np.argmin([np.median(gap) for gap in gaps]))])
-        late[part] = before
-        if part.stop == count:
-            break
-    told = late[np.isfinite(late)]
-    return np.where(np.isfinite(late), late, told[0] if len(told) else 0.0)
 
 
 def figures(one: Trace, other: Trace, names: str) -> tuple[tuple[Figure, ...], tuple[Plot, ...]]:

@@ -11,8 +11,6 @@ What it proves is that lamps are told apart and in what order; their strengths c
 divider and steps of its own clock, so 0.1 % amplitudes are not proved this way.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What was read from the robot computer against the truth, and against what a scenario expects."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """A robot computer that is none: `lumiloop run` as a process of this computer, on a pty and loopback."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

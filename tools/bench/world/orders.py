@@ -1,7 +1,5 @@
 """A scenario's faults, looked at before anything is played: words, arguments, and what the devices can do at all."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

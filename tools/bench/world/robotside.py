@@ -1,7 +1,5 @@
 """What the robot computer under test needs of a scenario: a configuration, and the survey of the lamps overhead."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 from typing import Final

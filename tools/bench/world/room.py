@@ -1,7 +1,5 @@
 """The benches' own room and lidar: small enough for an emulated computer, unlike itself everywhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

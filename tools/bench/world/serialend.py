@@ -1,7 +1,5 @@
 """The fake lidar out of a serial port that is there: a USB-serial adapter, or this computer's own CDC gadget."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import re

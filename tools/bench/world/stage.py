@@ -1,7 +1,5 @@
 """One scenario in real time: devices out of this computer's ports, poses in over Modbus, orders when they are due."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import re

@@ -5,8 +5,6 @@ sectors, safe radius) and by the paper's (closed form point-to-point, one merged
 idea is. Times are processor time of the match alone, taken in turn in one process; index and light not included.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final

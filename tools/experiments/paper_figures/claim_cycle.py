@@ -1,7 +1,5 @@
 """What a cycle of `step` costs without light, with light decoded already, and with a converter's samples."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ The idea is T1 of the paper: ``X_ref^-1 X_new``, with the poses of the `lights` 
 or of dead reckoning, each as known at the instant of its scan; "none" takes the robot to be where it was.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

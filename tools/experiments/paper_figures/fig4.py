@@ -6,8 +6,6 @@ at 0.3 m; powers 3 % off, lamps leaning by 1 degree, the receiver by 0.5 degree 
 epoch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final

@@ -5,8 +5,6 @@ from one set of strengths, and the halves change roles. `ml` gets gains, orders,
 can use gains and orders only, get a calibration without the rest. No residual map, no prior.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

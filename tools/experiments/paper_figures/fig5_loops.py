@@ -5,8 +5,6 @@ keyframes see from where they lie at the end; a line joins each keyframe that wa
 found in.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Pictures of Fig. 5: maps as scans put at the estimated poses, the estimated way, the true walls and the true way."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

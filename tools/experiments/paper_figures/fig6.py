@@ -9,8 +9,6 @@ our own laser-only branch and bound (Cartographer's way of searching, not Cartog
 Trials are kept as they are done, under a digest of the code: a run that was interrupted goes on where it was.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any, Final

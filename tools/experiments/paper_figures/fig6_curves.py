@@ -1,7 +1,5 @@
 """Precision and recall of detections under any set of conditions and any thresholds (definitions: fig6_truth)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ and bound over all places and headings: what comes of that is kept with every ju
 thresholds can be varied afterwards.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final

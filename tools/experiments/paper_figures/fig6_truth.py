@@ -7,8 +7,6 @@ pair, and the relative pose is within 0.20 m and 1 deg of the truth (strict: 0.1
 detections by all; recall is the share of the queries which have a near positive that got a right detection.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Final

@@ -6,8 +6,6 @@ the true pose. The real logs have no light: Intel with relations found by hand (
 without truth, so the mean distance between points of the map is given (`python -m tools.bench crispness`).
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 import tempfile

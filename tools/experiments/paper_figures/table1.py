@@ -4,8 +4,6 @@ Below the table's own rows stand those that the paper's text gives. What the roo
 scan of the drive included, and is not written down a second time.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

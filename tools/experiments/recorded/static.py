@@ -8,8 +8,6 @@ from their coordinates alone: the one nearest to the middle of the room, then ni
 already taken.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any, Final
 

@@ -7,8 +7,6 @@ recording's first seconds), as the column of a coded lamp is its whole pulse tra
 and the subspace of offset, drift and mains.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final

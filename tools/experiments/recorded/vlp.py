@@ -12,8 +12,6 @@ than one must know; what was found by fitting, and is checked by tests, is mende
 * walks: the truth file repeats strengths that are computed from a model; they are not read.
 """
 
-from __future__ import annotations
-
 import gzip
 import os
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ time, scored on the other. No run is told where it starts; heading is found from
 comes from its accelerometer, against its mean at rest (it is level there), a second to either side of the epoch.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, Final

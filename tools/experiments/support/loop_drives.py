@@ -4,8 +4,6 @@ Everything is at the level of `step`: decoded light epochs, a lidar of 180 deg w
 that slip. Jobs of the background worker are done between two steps; their answers come with the next one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from heapq import merge

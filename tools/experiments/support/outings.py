@@ -5,8 +5,6 @@ or down, by half to all of the given share. Everything is at the level of `step`
 epochs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from heapq import merge

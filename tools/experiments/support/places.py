@@ -1,7 +1,5 @@
 """Single positions under a simulated ceiling: what is received at many places, and how far solvers are off there."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

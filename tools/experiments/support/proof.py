@@ -1,7 +1,5 @@
 """What a count of failures in random trials proves of their share."""
 
-from __future__ import annotations
-
 from scipy.stats import beta
 
 

@@ -5,8 +5,6 @@ where something outside is missing (recorded data). With ``quick`` it does a sma
 a test can run it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Where the configuration is found, what says so, and `lumiloop config`."""
 
-from __future__ import annotations
-
 import logging
 import tomllib
 from pathlib import Path
@@ -12,6 +10,7 @@ from daemon.cli import parser
 from daemon.config import discovery, loader
 from daemon.config.discovery import find
 from daemon.system import console
+from tests.commands import Command
 
 PLACES = ["variable.toml", "lumiloop.toml", "home/lumiloop/lumiloop.toml", "etc/lumiloop.toml"]
 
@@ -62,13 +61,10 @@ def test_commands_say_what_they_use(places: list[Path], words: list[str], capsys
     assert str(places[2]) in out or 'name = "robot2"' in out
 
 
-def test_a_command_uses_the_configuration_that_was_found(
-    places: list[Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_uses_the_configuration_that_was_found(places: list[Path], refused: Command) -> None:
     """`status` finds the daemon's port in it."""
     places[0].write_text("[modbus]\nport = 1\n")
-    assert parser.main(["status"]) == console.FAILED
-    assert "127.0.0.1:1:" in capsys.readouterr().err
+    assert "127.0.0.1:1:" in refused("status")
 
 
 def test_the_log_of_a_run_names_the_file_and_no_more(
@@ -91,29 +87,25 @@ def test_the_log_of_a_run_names_the_file_and_no_more(
 
 
 def test_init_writes_a_template_that_changes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Command
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert parser.main(["config", "init"]) == console.OK
     file = tmp_path / "lumiloop.toml"
     assert loader.load(file) == loader.load(None)
     assert all(option.description in file.read_text() for option in loader.options())
-    assert parser.main(["config", "init"]) == console.FAILED
-    assert "--force" in capsys.readouterr().err
+    assert "--force" in refused("config", "init")
     uncommented = "".join(
         line.removeprefix("# ") if " = " in line else line for line in file.read_text().splitlines(keepends=True)
     )
     assert tomllib.loads(uncommented)["modbus"]["port"] == 1502
 
 
-def test_show_says_where_it_looked(
-    places: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_show_says_where_it_looked(places: list[Path], monkeypatch: pytest.MonkeyPatch, done: Command) -> None:
     for path in places:
         path.unlink()
     monkeypatch.delenv("LUMILOOP_CONFIG")
-    assert parser.main(["config", "show"]) == console.OK
-    said = capsys.readouterr().out
+    said = done("config", "show")
     assert said.startswith("# configuration: built-in values; no file was found\n# searched:\n#   lumiloop.toml (")
     assert tomllib.loads(said)["name"] == "lumiloop"
 

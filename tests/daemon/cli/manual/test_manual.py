@@ -1,7 +1,5 @@
 """Help on one screen, examples that run, suggestions, completion in a real shell, and man pages."""
 
-from __future__ import annotations
-
 import logging
 import os
 import pty
@@ -21,6 +19,7 @@ from daemon.cli.manual.command_parser import every, subcommands
 from daemon.cli.manual.completion import script
 from daemon.system import console
 from daemon.system import logging as our_logging
+from tests.commands import Command
 
 ROOT = Path(__file__).parents[4]
 NAMES = sorted(subcommands(parser.parser()))
@@ -47,14 +46,13 @@ def test_every_command_has_a_group_and_two_examples() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_examples_are_command_lines(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_examples_are_command_lines(name: str, done: Command) -> None:
     lines = [line for line, _ in EXAMPLES[name]]
     for line in lines:
         args = parser.parser().parse_args(shlex.split(line))
         assert args.command == name == line.split()[0]
         assert callable(args.body)
-    assert parser.main(["help", name]) == console.OK
-    said = capsys.readouterr().out
+    said = done("help", name)
     assert all(f"  lumiloop {line}\n" in said for line in lines)
     assert "--log-level" in said
 
@@ -82,9 +80,8 @@ def test_misspelt_words_are_answered_with_the_nearest(
     assert said.count("\n") == 2, "two lines: what is wrong, and where help is"
 
 
-def test_help_of_a_verb_and_of_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    assert parser.main(["help", "map", "import"]) == console.OK
-    assert "usage: lumiloop map import" in capsys.readouterr().out
+def test_help_of_a_verb_and_of_nothing(capsys: pytest.CaptureFixture[str], done: Command) -> None:
+    assert "usage: lumiloop map import" in done("help", "map", "import")
     assert parser.main(["help", "satus"]) == console.USAGE
     assert "did you mean status" in capsys.readouterr().err
 
@@ -192,11 +189,8 @@ def test_fish_completes_commands_verbs_and_options(line: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_scripts_hold_every_command_and_are_valid(
-    shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert parser.main(["completion", shell]) == console.OK
-    text = capsys.readouterr().out
+def test_completion_scripts_hold_every_command_and_are_valid(shell: str, tmp_path: Path, done: Command) -> None:
+    text = done("completion", shell)
     for words, command in every(parser.parser()):
         assert words[-1] in text
         for action in command._actions:
@@ -208,7 +202,7 @@ def test_completion_scripts_hold_every_command_and_are_valid(
         subprocess.run([program, "-n", str(file)], check=True)
 
 
-def test_man_pages_of_every_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_man_pages_of_every_command(tmp_path: Path, done: Command) -> None:
     assert parser.main(["man", "--out", str(tmp_path)]) == console.OK
     assert {path.name for path in tmp_path.iterdir()} == {"lumiloop.1", *(f"lumiloop-{name}.1" for name in NAMES)}
     page = (tmp_path / "lumiloop-set-pose.1").read_text()
@@ -217,8 +211,7 @@ def test_man_pages_of_every_command(tmp_path: Path, capsys: pytest.CaptureFixtur
     for path in tmp_path.iterdir():
         bad = [line for line in path.read_text().splitlines() if re.match(r"['.](?!TH|SH|SS|TP|PP|BR?\b)", line)]
         assert not bad, f"{path.name}: {bad}"
-    assert parser.main(["man", "run"]) == console.OK
-    assert capsys.readouterr().out.endswith((tmp_path / "lumiloop-run.1").read_text())
+    assert done("man", "run").endswith((tmp_path / "lumiloop-run.1").read_text())
     assert parser.main(["man", "fly"]) == console.USAGE
     if (groff := shutil.which("groff")) is not None:
         pages = [str(path) for path in tmp_path.iterdir()]

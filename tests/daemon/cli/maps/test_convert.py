@@ -1,7 +1,5 @@
 """Map files for other programs and back, each read by a reader of somebody else or by our own replay; align, name."""
 
-from __future__ import annotations
-
 import math
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """``lumiloop map info`` and ``map verify``: what they say, and that they load no compiler."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -16,55 +14,52 @@ from daemon.config.schema import Config
 from daemon.maps import edit
 from daemon.system import console
 from taps.fleet.placing import MAP, RECORD, Records, target_path
+from tests.commands import Command
 from tests.daemon.support.map_maker import Shape, content
 
 ROOT = Path(__file__).parents[4]
 
 
-def test_info_says_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_says_what_a_file_holds(tmp_path: Path, done: Command) -> None:
     path = tmp_path / "a.lumimap"
     path.write_bytes(content(Shape(lit=True, submaps=7, loose=1)))
-    assert parser.main(["map", "info", str(path)]) == console.OK
-    said = capsys.readouterr().out
+    said = done("map", "info", str(path))
     for words in ("map id            00001234", "second floor, Süd", "the light survey's", "2017-07-14 02:40:00 UTC"):
         assert words in said
-    assert parser.main(["map", "info", str(path), "--json"]) == console.OK
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(done("map", "info", str(path), "--json"))
     assert (found["submaps"], found["isolated_submaps"], found["lamps"]) == (6, 1, 6)
     assert found["bytes"] == path.stat().st_size
 
 
-def test_info_lists_the_maps_of_a_folder_newest_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_lists_the_maps_of_a_folder_newest_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], done: Command, refused: Command
+) -> None:
     first, second = (tmp_path / f"map-00001234-0000000{number}.lumimap" for number in (1, 2))
     other = tmp_path / "placed.lumimap"
     for path in (first, second):
         path.write_bytes(content())
     other.write_bytes(content(Shape(map_id=0x77)))
     for words in (["--set", f"map.folder={tmp_path}"], [str(tmp_path)]):
-        assert parser.main(["map", "info", *words]) == console.OK
-        head, *rows = capsys.readouterr().out.splitlines()
+        head, *rows = done("map", "info", *words).splitlines()
         assert head.split() == ["map", "id", "saved", "submaps", "name", "file"]
         assert [row.split()[0] for row in rows] == ["00001234", "00000077"]
         assert rows[0].endswith(str(second)), "the newest file of a map"
         assert "second floor, Süd" in rows[1]
-    assert parser.main(["map", "info", str(tmp_path), "--json"]) == console.OK
-    assert [one["map_id"] for one in json.loads(capsys.readouterr().out)["maps"]] == [0x1234, 0x77]
+    assert [one["map_id"] for one in json.loads(done("map", "info", str(tmp_path), "--json"))["maps"]] == [0x1234, 0x77]
     other.write_bytes(b"nothing")
     assert parser.main(["map", "info", str(tmp_path)]) == console.FAILED
     out, err = capsys.readouterr()
     assert "00001234" in out
     assert "placed.lumimap: " in err
-    assert parser.main(["map", "info", "--set", f"map.folder={tmp_path / 'none'}"]) == console.OK
-    assert "no map" in capsys.readouterr().out
+    assert "no map" in done("map", "info", "--set", f"map.folder={tmp_path / 'none'}")
     assert parser.main(["map", "info", "--set", "map.folder=none"]) == console.USAGE
     assert "maps are not stored" in capsys.readouterr().err
     os.mkfifo(tmp_path / "waits.lumimap")
-    assert parser.main(["map", "info", str(tmp_path)]) == console.FAILED
-    assert "waits.lumimap: cannot read the map: it is a FIFO" in capsys.readouterr().err
+    assert "waits.lumimap: cannot read the map: it is a FIFO" in refused("map", "info", str(tmp_path))
 
 
 def test_the_maps_of_the_service_are_meant_where_this_user_keeps_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: Command
 ) -> None:
     """As with sudo beside the service: else an imported map would lie in root's own folder, which no daemon reads."""
     monkeypatch.setattr(paths, "SERVICE_STATE", tmp_path / "service")
@@ -79,24 +74,21 @@ def test_the_maps_of_the_service_are_meant_where_this_user_keeps_none(
     assert Records().path == tmp_path / "service" / RECORD, "where the service of the fleet reads it"
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lumiloop.toml").write_text("")
-    assert parser.main(["map", "info"]) == console.OK
-    assert str(service) in capsys.readouterr().out
+    assert str(service) in done("map", "info")
     own.mkdir(parents=True)
     assert paths.stored_maps("") == own
     assert paths.maps_folder("") == own, "the daemon's own rule is unchanged"
 
 
-def test_verify_says_of_each_file_whether_it_is_good(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_says_of_each_file_whether_it_is_good(tmp_path: Path, done: Command, refused: Command) -> None:
     good, bad, torn = (tmp_path / f"{name}.lumimap" for name in ("good", "bad", "torn"))
     good.write_bytes(content())
     bad.write_bytes(content()[:-1])
     torn.write_bytes(content(Shape(submaps=8, loose=2)))
-    assert parser.main(["map", "verify", str(good), str(torn)]) == console.OK
-    said = capsys.readouterr().out
+    said = done("map", "verify", str(good), str(torn))
     assert f"{good}: valid, map 00001234\n" in said
     assert "2 submaps without an edge to the others" in said
-    assert parser.main(["map", "verify", str(good), str(bad), str(tmp_path / "none")]) == console.FAILED
-    said = capsys.readouterr().err
+    said = refused("map", "verify", str(good), str(bad), str(tmp_path / "none"))
     assert f"{bad}: it is" in said
     assert "truncated" in said
     assert "none: cannot read the map: No such file or directory" in said

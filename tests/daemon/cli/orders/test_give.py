@@ -1,7 +1,5 @@
 """`lumiloop pause` and the like against a running daemon's network: what is said, and the exit code."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math

@@ -1,7 +1,5 @@
 """One request in, one answer out: the short way and the codec's way, exceptions, writing."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

@@ -1,7 +1,5 @@
 """Modbus RTU: a line that is a pseudo-terminal, and one in memory."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

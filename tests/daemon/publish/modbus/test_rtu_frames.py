@@ -1,7 +1,5 @@
 """Modbus RTU: frames among noise and other devices' traffic."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

@@ -1,20 +1,19 @@
 """The server among clients that misbehave: nobody is disturbed, nothing is torn, connections have limits."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import logging
 import socket
 import struct
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
 
 from daemon.publish.modbus import counts, registers, tcp_endpoint, udp_endpoint
 from daemon.publish.modbus.server import ModbusPublisher
-from hal.clock import SystemClock, run_virtual
+from hal.clock import SystemClock
 from tests.daemon.publish.modbus.test_registers import snapshot
 from tests.daemon.publish.network import (
     BLOCK,
@@ -124,10 +123,11 @@ async def test_a_defect_is_told_to_the_client_and_wedges_nobody(caplog: pytest.L
     assert caplog.text.count("RuntimeError: a defect") == 1
 
 
-def test_a_connection_that_cannot_be_served_is_closed_and_the_others_are_served(
+@pytest.mark.virtual
+async def test_a_connection_that_cannot_be_served_is_closed_and_the_others_are_served(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+    async with an_endpoint() as endpoint:
         (bad, bad_wire), (good, good_wire) = plugged(endpoint), plugged(endpoint)
 
         def broken(_: int) -> bool:
@@ -139,8 +139,6 @@ def test_a_connection_that_cannot_be_served_is_closed_and_the_others_are_served(
         await asyncio.sleep(0.1)
         assert bad_wire.gone
         assert len(good_wire.sent) == 20 * 137
-
-    in_virtual_time(body)
 
 
 async def test_a_defect_leaves_no_age_behind(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,18 +203,17 @@ async def test_a_read_is_never_torn() -> None:
         assert all(len(numbers) > 50 for numbers in seen), "the snapshot must have changed while it was read"
 
 
-def in_virtual_time(body: Callable[[tcp_endpoint.TcpEndpoint], Coroutine[Any, Any, None]]) -> None:
-    async def run() -> None:
-        publisher = ModbusPublisher(SystemClock())
-        endpoint = tcp_endpoint.TcpEndpoint(publisher._responder, publisher.counts)
-        await body(endpoint)
-        await endpoint.close()
-
-    run_virtual(run())
+@asynccontextmanager
+async def an_endpoint() -> AsyncGenerator[tcp_endpoint.TcpEndpoint]:
+    publisher = ModbusPublisher(SystemClock())
+    endpoint = tcp_endpoint.TcpEndpoint(publisher._responder, publisher.counts)
+    yield endpoint
+    await endpoint.close()
 
 
-def test_idle_and_half_open_connections_are_dropped() -> None:
-    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+@pytest.mark.virtual
+async def test_idle_and_half_open_connections_are_dropped() -> None:
+    async with an_endpoint() as endpoint:
         idle, busy, partial = plugged(endpoint), plugged(endpoint), plugged(endpoint)
         await asyncio.sleep(30.0)
         partial[0].data_received(request(1, *BLOCK)[:7])
@@ -231,11 +228,10 @@ def test_idle_and_half_open_connections_are_dropped() -> None:
         assert not busy[1].gone
         assert endpoint.counts.dropped == 2
 
-    in_virtual_time(body)
 
-
-def test_a_client_that_trickles_bytes_is_dropped_too() -> None:
-    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+@pytest.mark.virtual
+async def test_a_client_that_trickles_bytes_is_dropped_too() -> None:
+    async with an_endpoint() as endpoint:
         connection, wire = plugged(endpoint)
         for byte in request(1, *BLOCK)[:11] * 3:
             if wire.gone:
@@ -244,11 +240,10 @@ def test_a_client_that_trickles_bytes_is_dropped_too() -> None:
             await asyncio.sleep(tcp_endpoint.PARTIAL_S - 1.0)
         assert wire.gone
 
-    in_virtual_time(body)
 
-
-def test_answers_that_are_not_read_stop_the_service_then_the_connection() -> None:
-    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+@pytest.mark.virtual
+async def test_answers_that_are_not_read_stop_the_service_then_the_connection() -> None:
+    async with an_endpoint() as endpoint:
         connection, wire = plugged(endpoint)
         connection.data_received(request(1, *BLOCK))
         connection.pause_writing()
@@ -266,13 +261,11 @@ def test_answers_that_are_not_read_stop_the_service_then_the_connection() -> Non
         await asyncio.sleep(tcp_endpoint.STUCK_S + 2.0)
         assert wire.gone
 
-    in_virtual_time(body)
 
-
-def test_a_full_house_drops_the_longest_idle_or_refuses(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.virtual
+async def test_a_full_house_drops_the_longest_idle_or_refuses(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-
-    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+    async with an_endpoint() as endpoint:
         house = [plugged(endpoint, f"192.0.2.{n % 2}") for n in range(counts.MAX_CONNECTIONS)]
         _, refused = plugged(endpoint, "192.0.2.1")
         assert refused.gone
@@ -284,8 +277,6 @@ def test_a_full_house_drops_the_longest_idle_or_refuses(caplog: pytest.LogCaptur
         assert not admitted.gone
         assert [number for number, (_, wire) in enumerate(house) if wire.gone] == [5]
         assert endpoint.counts.connections == counts.MAX_CONNECTIONS
-
-    in_virtual_time(body)
     assert [record.message.partition(" is ")[2] for record in caplog.records] == [counts.CROWDED.removeprefix("is ")]
 
 
@@ -297,11 +288,11 @@ def served(connection: tcp_endpoint.Connection, wire: Wire) -> bool:
     return len(wire.sent) > before
 
 
-def test_one_host_never_takes_all_connections(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.virtual
+async def test_one_host_never_takes_all_connections(caplog: pytest.LogCaptureFixture) -> None:
     """However often it connects and asks, another one is served; its own idle connections make place for it."""
     caplog.set_level(logging.INFO)
-
-    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+    async with an_endpoint() as endpoint:
         flood = [plugged(endpoint, "192.0.2.9") for _ in range(2 * counts.MAX_CONNECTIONS)]
         assert sum(served(*one) for one in flood) == endpoint.counts.connections == counts.PER_HOST == 24
         honest = [plugged(endpoint, f"192.0.2.{n}") for n in range(8)]
@@ -314,13 +305,12 @@ def test_one_host_never_takes_all_connections(caplog: pytest.LogCaptureFixture) 
         assert served(*late)
         assert flood[0][1].gone
         assert all(served(*one) for one in honest)
-
-    in_virtual_time(body)
     assert any("it uses 24 of the 32 connections" in record.message for record in caplog.records)
 
 
-def test_in_a_full_house_the_host_with_most_makes_place_for_another_one() -> None:
-    async def body(endpoint: tcp_endpoint.TcpEndpoint) -> None:
+@pytest.mark.virtual
+async def test_in_a_full_house_the_host_with_most_makes_place_for_another_one() -> None:
+    async with an_endpoint() as endpoint:
         house = [plugged(endpoint, f"2001:db8:0:{n % 2}::{n + 1:x}") for n in range(counts.MAX_CONNECTIONS)]
         assert all(served(*one) for one in house)
         others = [plugged(endpoint, f"192.0.2.{n}") for n in range(40)]
@@ -328,5 +318,3 @@ def test_in_a_full_house_the_host_with_most_makes_place_for_another_one() -> Non
         assert not any(served(*one) for one in others[30:])
         for subnet in (0, 1):
             assert sum(not wire.gone for _, wire in house[subnet::2]) == 1
-
-    in_virtual_time(body)

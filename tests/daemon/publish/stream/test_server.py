@@ -17,8 +17,6 @@ from typing import Any, ClassVar, cast
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from daemon.publish.stream import server as stream_server
 from daemon.publish.stream import session as stream_session
@@ -310,16 +308,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(DeviceRefused, match="give write access"):
         asyncio.run(serve(tmp_path / "stream").run())
-
-
-@given(st.lists(st.binary(max_size=200), max_size=8))
-@settings(max_examples=200, deadline=None)
-def test_any_bytes_from_a_client_do_no_harm(chunks: list[bytes]) -> None:
-    client = Client(serve(Path("unused")))
-    for chunk in chunks:
-        client.data_received(chunk)
-    assert client.wants <= set(stream_server.TOPICS)
-    assert len(client._received) <= stream_session.LONGEST_REQUEST + 4 or client.wants == frozenset()
 
 
 def test_a_scan_message_names_everything_a_reader_needs() -> None:

@@ -1,11 +1,9 @@
 """The fake's chips, byte for byte by their data sheets."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from hal.fake.adc.chips import T_ACQUIRE_S, Adc121c021, Ads1x15, Lm75, Mcp3221
+from hal.fake.adc.chips import Adc121c021, Ads1x15, Lm75, Mcp3221
 from hal.fake.adc.i2c_timing import SclTiming
 
 LINE = SclTiming(10.0, 400e3)
@@ -33,22 +31,6 @@ def test_mcp3221_words(fraction: float, word: str) -> None:
     assert chip.read(3, LINE).hex() == (word * 2)[:6]
 
 
-def test_conversions_are_18_clocks_apart_and_begin_after_the_address() -> None:
-    asked: list[np.ndarray] = []  # type: ignore[type-arg]  # of floats
-
-    def source(t: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]  # of floats
-        asked.append(t)
-        return 0.0 * t
-
-    Mcp3221(source).read(6, LINE)
-    assert asked[0] == pytest.approx(10.0 + np.array([8, 26, 44]) / 400e3 + T_ACQUIRE_S)
-
-
-def test_a_stall_delays_what_comes_after_it() -> None:
-    line = SclTiming(0.0, 400e3, ((9.5 + 9 * 2, 1e-3),))
-    assert line.times([8, 26, 28, 44]) == pytest.approx(np.array([8, 26, 428, 444]) / 400e3)
-
-
 def test_the_first_word_after_a_pause_is_an_old_one() -> None:
     chip = Mcp3221(lambda t: t / 20.0)
     chip.read(200, LINE)
@@ -59,18 +41,6 @@ def test_the_first_word_after_a_pause_is_an_old_one() -> None:
     assert int.from_bytes(old[2:], "big") == int(4096 * 11.0 / 20)
 
 
-def test_adc121c021_registers_after_power_on() -> None:
-    chip = Adc121c021(constant(0.25))  # type: ignore[arg-type]  # a sample source
-    expected = {1: "00", 2: "00", 3: "0000", 4: "0fff", 5: "0000", 6: "0fff", 7: "0000"}
-    for register, value in expected.items():
-        chip.write(bytes([register]), 0.0)
-        assert chip.read(len(value) // 2, LINE).hex() == value
-    chip.write(b"\x00", 0.0)
-    assert chip.read(4, LINE).hex() == "04000400"
-    chip.write(b"\x06", 0.0)
-    assert chip.read(2, LINE).hex() == "0400"
-
-
 def test_adc121c021_alert_flag_is_the_top_bit() -> None:
     chip = Adc121c021(constant(0.25))  # type: ignore[arg-type]  # a sample source
     chip.write(b"\x03\x05\x00", 0.0)  # low limit above what is converted
@@ -79,14 +49,6 @@ def test_adc121c021_alert_flag_is_the_top_bit() -> None:
     assert chip.read(2, LINE).hex() == "8400"
     chip.power_on(0.0)
     assert chip.read(2, LINE).hex() == "0400"
-
-
-def test_ads1115_after_power_on() -> None:
-    chip = Ads1x15(constant(0.5))  # type: ignore[arg-type]  # a sample source
-    assert chip.read(4, LINE).hex() == "00000000"
-    for pointer, value in ((1, "8583"), (2, "8000"), (3, "7fff")):
-        chip.write(bytes([pointer]), 0.0)
-        assert chip.read(2, LINE).hex() == value
 
 
 def test_ads1115_continuous() -> None:

@@ -1,7 +1,5 @@
 """The simulated receiver as a process, and its light."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,14 +1,12 @@
 """A whole receiver in a process of its own, and the real driver on its bus: real sockets, real threads, real time."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -94,26 +92,22 @@ async def running(where: str) -> AsyncIterator[tuple[PhotodiodeAdc, list[RawSamp
         await asyncio.gather(task, return_exceptions=True)
 
 
-Body = Callable[[Receiver, PhotodiodeAdc, list[RawSamples]], Awaitable[None]]
-
-
-def with_receiver(body: Body, folder: Path, where: str = "") -> None:
-    async def main() -> None:
-        receiver = Receiver(folder, where)
-        receiver.start()
-        try:
-            async with running(receiver.where) as (driver, blocks):
-                await until(lambda: len(blocks) >= 5, 2.0, driver.status)
-                await body(receiver, driver, blocks)
-        finally:
-            assert receiver.stop() == 0
-
-    asyncio.run(main())
+@asynccontextmanager
+async def a_receiver(folder: Path, where: str = "") -> AsyncIterator[tuple[Receiver, PhotodiodeAdc, list[RawSamples]]]:
+    """A receiver in a process of its own, a driver that reads it, and its blocks."""
+    receiver = Receiver(folder, where)
+    receiver.start()
+    try:
+        async with running(receiver.where) as (driver, blocks):
+            await until(lambda: len(blocks) >= 5, 2.0, driver.status)
+            yield receiver, driver, blocks
+    finally:
+        assert receiver.stop() == 0
 
 
 @pytest.mark.parametrize("where", ["", "tcp://127.0.0.1:0"], ids=["unix", "tcp"])
-def test_blocks_come_and_are_what_they_should_be(where: str, tmp_path: Path) -> None:
-    async def body(receiver: Receiver, driver: PhotodiodeAdc, blocks: list[RawSamples]) -> None:
+async def test_blocks_come_and_are_what_they_should_be(where: str, tmp_path: Path) -> None:
+    async with a_receiver(tmp_path, where) as (_, driver, blocks):
         await until(lambda: len(blocks) >= 60, 4.0, driver.status)
         assert driver.status.link is Link.STREAMING
         assert driver.status.extra["chip"] == "MCP3221"
@@ -121,8 +115,6 @@ def test_blocks_come_and_are_what_they_should_be(where: str, tmp_path: Path) -> 
         assert all(abs(block.rate_hz * 18 / 400e3 - 1.0) < 0.05 for block in blocks)
         assert not any(block.blemish & ~(Blemish.STRETCHED | Blemish.GAP) for block in blocks)
         assert all(block.t0 < block.t_first < block.t1 for block in blocks)
-
-    with_receiver(body, tmp_path, where)
 
 
 @pytest.mark.parametrize(
@@ -134,8 +126,8 @@ def test_blocks_come_and_are_what_they_should_be(where: str, tmp_path: Path) -> 
         ("order dark for=3", DeviceFault, "dark: no light|no light at all"),
     ],
 )
-def test_faults_show_and_pass(order: str, noun: type[HalError], says: str, tmp_path: Path) -> None:
-    async def body(receiver: Receiver, driver: PhotodiodeAdc, blocks: list[RawSamples]) -> None:
+async def test_faults_show_and_pass(order: str, noun: type[HalError], says: str, tmp_path: Path) -> None:
+    async with a_receiver(tmp_path) as (receiver, driver, blocks):
         await receiver.order(order)
         await until(lambda: isinstance(driver.status.error, noun), 2.0, driver.status)
         error = driver.status.error
@@ -147,11 +139,9 @@ def test_faults_show_and_pass(order: str, noun: type[HalError], says: str, tmp_p
         await until(lambda: driver.status.error is None and len(blocks) > seen + 5, 7.0, driver.status)
         assert driver.status.link is Link.STREAMING
 
-    with_receiver(body, tmp_path)
 
-
-def test_a_receiver_that_is_killed_and_comes_back(tmp_path: Path) -> None:
-    async def body(receiver: Receiver, driver: PhotodiodeAdc, blocks: list[RawSamples]) -> None:
+async def test_a_receiver_that_is_killed_and_comes_back(tmp_path: Path) -> None:
+    async with a_receiver(tmp_path) as (receiver, driver, blocks):
         threads, files = threading.active_count(), len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - count only
         for _ in range(3):
             assert receiver.stop(signal.SIGKILL) == -signal.SIGKILL
@@ -164,13 +154,10 @@ def test_a_receiver_that_is_killed_and_comes_back(tmp_path: Path) -> None:
         assert threading.active_count() <= threads + 1  # one to wait in, of the event loop
         assert len(os.listdir("/proc/self/fd")) <= files + 2  # noqa: PTH208 - count only
 
-    with_receiver(body, tmp_path)
 
-
-def test_a_receiver_that_is_stopped_for_a_while(tmp_path: Path) -> None:
+async def test_a_receiver_that_is_stopped_for_a_while(tmp_path: Path) -> None:
     """SIGSTOP: nothing is closed, nothing answers."""
-
-    async def body(receiver: Receiver, driver: PhotodiodeAdc, blocks: list[RawSamples]) -> None:
+    async with a_receiver(tmp_path) as (receiver, driver, blocks):
         assert receiver.process is not None
         receiver.process.send_signal(signal.SIGSTOP)
         try:
@@ -181,8 +168,6 @@ def test_a_receiver_that_is_stopped_for_a_while(tmp_path: Path) -> None:
             receiver.process.send_signal(signal.SIGCONT)
         seen = len(blocks)
         await until(lambda: len(blocks) > seen + 5 and driver.status.error is None, 6.0, driver.status)
-
-    with_receiver(body, tmp_path)
 
 
 def test_probe_of_a_receiver(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Fault orders as data: reading, refusing with the path, chance, count and time."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable
 from typing import ClassVar

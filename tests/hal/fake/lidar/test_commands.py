@@ -1,15 +1,13 @@
 """What a sensor refuses, with which status, and how lines of the host are read."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hal.fake.lidar.models import MODELS, URG_04LX, UST_10LX, UTM_30LX, LidarModel, Unit
-from tests.hal.fake.bench import Talk, virtual
+from hal.fake.lidar.models import URG_04LX, UST_10LX, UTM_30LX, Unit
+from tests.hal.fake.bench import Talk, talking, virtual
 
 
 @pytest.mark.parametrize(
@@ -58,69 +56,61 @@ def test_start_below_amin_is_refused() -> None:
     assert virtual(lambda talk: talk.status("MD0043072500000"), URG_04LX) == "04"
 
 
-def test_status_lines_are_byte_exact() -> None:
-    async def scene(talk: Talk) -> bytes:
-        raw = b""
-        for line in ("GD0540054201", "XX", "BM", "BM", "GD0540200001", "CR00"):
-            await talk.ask(line, 0.1)
-            raw += talk.raw
-        return raw
-
-    raw = virtual(scene, replace(URG_04LX, amin=0, amax=1080))
+@talking(replace(URG_04LX, amin=0, amax=1080))
+async def test_status_lines_are_byte_exact(talk: Talk) -> None:
+    raw = b""
+    for line in ("GD0540054201", "XX", "BM", "BM", "GD0540200001", "CR00"):
+        await talk.ask(line, 0.1)
+        raw += talk.raw
     expected = b"GD0540054201\n10Q\n\nXX\n0Ee\n\nBM\n00P\n\nBM\n02R\n\nGD0540200001\n04T\n\nCR00\n03S\n\n"
     assert raw == expected
 
 
 @pytest.mark.parametrize("text", ["VV\n", "VV\r", "VV\r\n", "\nVV\n", "\n\n\rVV\n\n"])
-def test_ends_of_line(text: str) -> None:
-    async def scene(talk: Talk) -> bytes:
-        talk.say(text)
-        await asyncio.sleep(0.1)
-        return talk.raw
-
-    assert virtual(scene).count(b"VV\n00P\n") == 1
+@talking()
+async def test_ends_of_line(talk: Talk, text: str) -> None:
+    talk.say(text)
+    await asyncio.sleep(0.1)
+    assert talk.raw.count(b"VV\n00P\n") == 1
 
 
-def test_a_line_may_come_in_pieces() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        for char in "TM1;a7\n":
-            talk.say(char)
-            await asyncio.sleep(0.01)
-        await asyncio.sleep(0.1)
-        return [reply.echo for reply in talk.replies()]
-
-    assert virtual(scene) == ["TM1;a7"]
+@talking()
+async def test_a_line_may_come_in_pieces(talk: Talk) -> None:
+    for char in "TM1;a7\n":
+        talk.say(char)
+        await asyncio.sleep(0.01)
+    await asyncio.sleep(0.1)
+    assert [reply.echo for reply in talk.replies()] == ["TM1;a7"]
 
 
-def test_an_endless_line_is_cut_and_refused() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        for _ in range(50):
-            talk.say("A" * 1000)
-        talk.say("\nVV\n")
-        await asyncio.sleep(0.2)
-        replies = talk.replies()
-        assert len(replies[0].echo) < 300
-        return [reply.status for reply in replies]
-
-    assert virtual(scene) == ["0E", "00"]
+@talking()
+async def test_an_endless_line_is_cut_and_refused(talk: Talk) -> None:
+    for _ in range(50):
+        talk.say("A" * 1000)
+    talk.say("\nVV\n")
+    await asyncio.sleep(0.2)
+    replies = talk.replies()
+    assert len(replies[0].echo) < 300
+    assert [reply.status for reply in replies] == ["0E", "00"]
 
 
-def test_bytes_that_are_no_ascii_are_echoed_and_refused() -> None:
-    async def scene(talk: Talk) -> bytes:
-        talk.say("\xff\xfe\x00\n")
-        await asyncio.sleep(0.1)
-        return talk.raw
-
-    assert virtual(scene) == b"\xff\xfe\x00\n0Ee\n\n"
+@talking()
+async def test_bytes_that_are_no_ascii_are_echoed_and_refused(talk: Talk) -> None:
+    talk.say("\xff\xfe\x00\n")
+    await asyncio.sleep(0.1)
+    assert talk.raw == b"\xff\xfe\x00\n0Ee\n\n"
 
 
-def test_different_commands_queue_and_the_same_one_is_refused_once() -> None:
-    async def scene(talk: Talk) -> list[tuple[str, str]]:
-        talk.say("VV\nPP\nVV\nVV\nII\n")
-        await asyncio.sleep(0.2)
-        return [(reply.echo, reply.status) for reply in talk.replies()]
-
-    assert virtual(scene) == [("VV", "00"), ("VV", "0B"), ("PP", "00"), ("II", "00")]
+@talking()
+async def test_different_commands_queue_and_the_same_one_is_refused_once(talk: Talk) -> None:
+    talk.say("VV\nPP\nVV\nVV\nII\n")
+    await asyncio.sleep(0.2)
+    assert [(reply.echo, reply.status) for reply in talk.replies()] == [
+        ("VV", "00"),
+        ("VV", "0B"),
+        ("PP", "00"),
+        ("II", "00"),
+    ]
 
 
 def test_a_tag_is_echoed_and_the_stamp_is_the_clock() -> None:
@@ -133,13 +123,11 @@ def test_a_tag_is_echoed_and_the_stamp_is_the_clock() -> None:
     assert virtual(scene, still, unit=Unit(clock_ms=0x123456)) == b"TM1;a7\n00P\n4SAF>\n\n"
 
 
-def test_urg_04lx_says_what_a_real_one_said() -> None:
-    async def scene(talk: Talk) -> bytes:
-        talk.say("VV\nPP\nII\n")
-        await asyncio.sleep(0.5)
-        return talk.raw
-
-    raw = virtual(scene, URG_04LX, unit=Unit(serial="H0706400", clock_ms=0x6A5404 - 1000)).decode()
+@talking(URG_04LX, unit=Unit(serial="H0706400", clock_ms=0x6A5404 - 1000))
+async def test_urg_04lx_says_what_a_real_one_said(talk: Talk) -> None:
+    talk.say("VV\nPP\nII\n")
+    await asyncio.sleep(0.5)
+    raw = talk.raw.decode()
     vv, pp, ii, rest = raw.split("\n\n")
     assert rest == ""
     assert vv == (
@@ -158,84 +146,42 @@ def test_urg_04lx_says_what_a_real_one_said() -> None:
     assert lines[8] == "STAT:Sensor works well.;8"
 
 
-@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_every_model_states_itself(model: LidarModel) -> None:
-    async def scene(talk: Talk) -> None:
-        pp = (await talk.one("PP")).pairs
-        keys = {"DMIN": "dmin", "DMAX": "dmax", "ARES": "ares", "AMIN": "amin", "AMAX": "amax", "AFRT": "afrt"}
-        assert {key: int(pp[key]) for key in keys} == {key: getattr(model, name) for key, name in keys.items()}
-        assert abs(60.0 / int(pp["SCAN"]) - model.true_period_s) < 0.01 * model.true_period_s
-        assert (await talk.one("VV")).pairs["PROD"] == model.prod
-        assert "MODL" in (await talk.one("II")).pairs
-        for name in ("MD", "MS", "ME", "ND", "NE"):
-            tail = f"{model.amin:04d}{model.amin:04d}00001"
-            expected = "00" if name in model.measures else "0E"
-            assert await talk.status(name + tail) == expected
-
-    virtual(scene, model)
-
-
-def test_new_baud_rate_after_the_reply() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        port = talk.port
-        assert port is not None
-        statuses = [await talk.status("SS115200")]
-        await talk.ask("VV", 0.0)
-        await asyncio.sleep(0.5)
-        assert talk.raw == b""  # what the host says at the old rate is noise to the sensor
-        port.set_baud(115200)
-        statuses.append(await talk.status("VV"))
-        statuses.append(await talk.status("RT"))  # keeps the rate
-        statuses.append(await talk.status("VV"))
-        statuses.append(await talk.status("RS"))  # back to the rate it has after power-on
-        assert talk.device.baud == 19200
-        return statuses
-
-    assert virtual(scene, URG_04LX) == ["00"] * 5
-
-
-def test_host_at_another_rate_hears_noise() -> None:
-    async def scene(talk: Talk) -> bytes:
-        talk.say("MD0044072500000\n")
-        await asyncio.sleep(0.5)
-        assert talk.port is not None
-        talk.port.set_baud(57600)
-        talk.pieces.clear()
-        await asyncio.sleep(3.0)
-        return talk.raw
-
-    raw = virtual(scene, URG_04LX)
+@talking(URG_04LX)
+async def test_host_at_another_rate_hears_noise(talk: Talk) -> None:
+    talk.say("MD0044072500000\n")
+    await asyncio.sleep(0.5)
+    assert talk.port is not None
+    talk.port.set_baud(57600)
+    talk.pieces.clear()
+    await asyncio.sleep(3.0)
+    raw = talk.raw
     assert len(raw) > 2000
     assert len(set(raw)) > 200
 
 
-def test_motor_speed() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        talk.say("MD0044004400000\n")
-        await asyncio.sleep(0.5)
-        statuses = [await talk.status(line) for line in ("CR00", "CR11", "CRxx")]
-        talk.pieces.clear()
-        talk.say("CR10\n")
-        await asyncio.sleep(3.0)
-        ticks = [scan.tick for scan in talk.scans()]
-        assert np.diff(ticks[-10:]) == pytest.approx(100.2 / 0.9, abs=1.0)
-        statuses.append(await talk.status("CR10"))
-        await talk.ask("RS", 2.0)
-        await talk.ask("MD0044004400000", 3.0)
-        assert np.diff([scan.tick for scan in talk.scans()]) == pytest.approx(100.2, abs=1.0)
-        return statuses
-
-    assert virtual(scene, URG_04LX) == ["03", "02", "01", "03"]
+@talking(URG_04LX)
+async def test_motor_speed(talk: Talk) -> None:
+    talk.say("MD0044004400000\n")
+    await asyncio.sleep(0.5)
+    statuses = [await talk.status(line) for line in ("CR00", "CR11", "CRxx")]
+    talk.pieces.clear()
+    talk.say("CR10\n")
+    await asyncio.sleep(3.0)
+    ticks = [scan.tick for scan in talk.scans()]
+    assert np.diff(ticks[-10:]) == pytest.approx(100.2 / 0.9, abs=1.0)
+    statuses.append(await talk.status("CR10"))
+    await talk.ask("RS", 2.0)
+    await talk.ask("MD0044004400000", 3.0)
+    assert np.diff([scan.tick for scan in talk.scans()]) == pytest.approx(100.2, abs=1.0)
+    assert statuses == ["03", "02", "01", "03"]
 
 
-def test_a_flood_of_commands_does_not_fill_the_memory() -> None:
-    async def scene(talk: Talk) -> int:
-        for k in range(10000):
-            talk.say(f"TM1;{k}\n")
-        await asyncio.sleep(5.0)
-        return len(talk.replies())
-
-    assert virtual(scene) <= 40
+@talking()
+async def test_a_flood_of_commands_does_not_fill_the_memory(talk: Talk) -> None:
+    for k in range(10000):
+        talk.say(f"TM1;{k}\n")
+    await asyncio.sleep(5.0)
+    assert len(talk.replies()) <= 40
 
 
 def test_ethernet_has_no_baud_rate() -> None:

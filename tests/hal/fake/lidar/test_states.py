@@ -1,15 +1,15 @@
-"""Every command in every state, for both dialects, against a table written down from the specifications."""
-
-from __future__ import annotations
+"""States of the fake lidar, and the world that it scans."""
 
 import asyncio
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from hal.fake.lidar.dialect_grid import State
 from hal.fake.lidar.models import UST_10LX, UTM_30LX, LidarModel, Unit
-from tests.hal.fake.bench import Talk, virtual
+from hal.fake.lidar.scan_world import Room
+from tests.hal.fake.bench import Talk, talking, virtual
 
 UST = replace(UST_10LX, link="usb")  # so that the line can be opened while it starts
 
@@ -112,71 +112,62 @@ def test_time_outside_time_adjust(strict: bool, status: str) -> None:
     assert virtual(lambda talk: talk.status("TM1"), unit=Unit(strict_time=strict)) == status
 
 
-def test_codes_of_the_state_query() -> None:
-    async def scene(talk: Talk) -> dict[str, str]:
-        out = {}
-        for state in COLUMNS:
-            await bring(talk, state)
-            (line,) = [reply.lines[0] for reply in await talk.ask("%ST") if reply.echo == "%ST"]
-            out[state] = line[:3]
-            talk.schedule.clear()
-            talk.schedule.load('[[fault]]\nwhat = "reset"')
-            await asyncio.sleep(3.0)
-        return out
-
-    codes = virtual(scene, UST)
+@talking(UST)
+async def test_codes_of_the_state_query(talk: Talk) -> None:
+    out = {}
+    for state in COLUMNS:
+        await bring(talk, state)
+        (line,) = [reply.lines[0] for reply in await talk.ask("%ST") if reply.echo == "%ST"]
+        out[state] = line[:3]
+        talk.schedule.clear()
+        talk.schedule.load('[[fault]]\nwhat = "reset"')
+        await asyncio.sleep(3.0)
+    codes = out
     assert codes == dict(zip(COLUMNS, ["001", "000", "003", "004", "002", "900", "005"], strict=True))
 
 
-def test_reboot_needs_two_requests_within_a_second() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        statuses = [await talk.status("RB")]
-        await asyncio.sleep(1.0)
-        statuses.append(await talk.status("RB"))  # too late: counts as a first one
-        statuses += [reply.status for reply in await talk.ask("RB", 0.05)]
-        await asyncio.sleep(1.1)
-        assert talk.lost is not None
-        assert not talk.device.reachable
-        await asyncio.sleep(2.0)
-        assert talk.device.reachable
-        return statuses
-
-    assert virtual(scene) == ["01", "01", "00"]
+@talking()
+async def test_reboot_needs_two_requests_within_a_second(talk: Talk) -> None:
+    statuses = [await talk.status("RB")]
+    await asyncio.sleep(1.0)
+    statuses.append(await talk.status("RB"))  # too late: counts as a first one
+    statuses += [reply.status for reply in await talk.ask("RB", 0.05)]
+    await asyncio.sleep(1.1)
+    assert talk.lost is not None
+    assert not talk.device.reachable
+    await asyncio.sleep(2.0)
+    assert talk.device.reachable
+    assert statuses == ["01", "01", "00"]
 
 
-def test_reboot_recovers_from_error_and_zeroes_the_clock() -> None:
-    async def scene(talk: Talk) -> None:
-        await bring(talk, "ERROR")
-        trouble = (await talk.one("II")).pairs
-        assert trouble["STAT"] == "Trouble!! Error No. =[00->70]"
-        await talk.ask("RB\nRB", 0.5)
-        await asyncio.sleep(3.0)
-        await talk.open()
-        after = (await talk.one("II")).pairs
-        assert after["STAT"] == "Sensor works well."
-        assert int(after["TIME"], 16) < 3000
-
-    virtual(scene, unit=Unit(clock_ms=1_000_000))
+@talking(unit=Unit(clock_ms=1_000_000))
+async def test_reboot_recovers_from_error_and_zeroes_the_clock(talk: Talk) -> None:
+    await bring(talk, "ERROR")
+    trouble = (await talk.one("II")).pairs
+    assert trouble["STAT"] == "Trouble!! Error No. =[00->70]"
+    await talk.ask("RB\nRB", 0.5)
+    await asyncio.sleep(3.0)
+    await talk.open()
+    after = (await talk.one("II")).pairs
+    assert after["STAT"] == "Sensor works well."
+    assert int(after["TIME"], 16) < 3000
 
 
-def test_start_up() -> None:
-    async def scene(talk: Talk) -> tuple[list[str], list[str]]:
-        await asyncio.sleep(0.6)
-        await talk.open()
-        early = [reply.pairs["MESM"] for reply in await talk.ask("II", 0.2)]
-        await asyncio.sleep(0.5)
-        return early, [reply.pairs["MESM"] for reply in await talk.ask("II")]
+@talking(unit=Unit(booted=False))
+async def test_start_up(talk: Talk) -> None:
+    await asyncio.sleep(0.6)
+    await talk.open()
+    early = [reply.pairs["MESM"] for reply in await talk.ask("II", 0.2)]
+    await asyncio.sleep(0.5)
+    assert early == ["001 Booting"]
+    assert [reply.pairs["MESM"] for reply in await talk.ask("II")] == ["IDLE"]
 
-    assert virtual(scene, unit=Unit(booted=False)) == (["001 Booting"], ["IDLE"])
 
-
-def test_scip_1_until_switched() -> None:
-    async def scene(talk: Talk) -> bytes:
-        talk.say("QT\nV\nSCIP2.0\nVV\nSCIP2.0\n")
-        await asyncio.sleep(0.5)
-        return talk.raw
-
-    raw = virtual(scene, unit=Unit(scip1=True))
+@talking(unit=Unit(scip1=True))
+async def test_scip_1_until_switched(talk: Talk) -> None:
+    talk.say("QT\nV\nSCIP2.0\nVV\nSCIP2.0\n")
+    await asyncio.sleep(0.5)
+    raw = talk.raw
     first, rest = raw.split(b"\n\n", 1)
     assert first == b"QT\nE"
     assert rest.startswith(b"V\n0\nVEND:Hokuyo Automatic Co.,Ltd.\n")
@@ -184,15 +175,13 @@ def test_scip_1_until_switched() -> None:
     assert rest.endswith(b"\n\nSCIP2.0\n0Ee\n\n")
 
 
-def test_no_scan_before_the_motor_turns() -> None:
-    async def scene(talk: Talk) -> float:
-        await asyncio.sleep(1.1)
-        await talk.open()
-        talk.say("MD0000108000001\n")
-        await asyncio.sleep(5.0)
-        return talk.scans()[0].t
-
-    assert 4.0 < virtual(scene, unit=Unit(booted=False, spin_up_s=4.0)) < 4.1
+@talking(unit=Unit(booted=False, spin_up_s=4.0))
+async def test_no_scan_before_the_motor_turns(talk: Talk) -> None:
+    await asyncio.sleep(1.1)
+    await talk.open()
+    talk.say("MD0000108000001\n")
+    await asyncio.sleep(5.0)
+    assert 4.0 < talk.scans()[0].t < 4.1
 
 
 @pytest.mark.parametrize("link", ["usb", "rs232", "ethernet"])
@@ -208,3 +197,17 @@ def test_a_host_that_leaves(link: str) -> None:
 
     after = virtual(scene, replace(UTM_30LX, link=link))  # type: ignore[arg-type]  # a str of the three
     assert after is (State.IDLE if link == "ethernet" else State.MULTI)
+
+
+def test_room_is_seen_as_it_is() -> None:
+    """The back wall and the right-hand wall, as the sensor sees them from where it is."""
+    room = Room(UTM_30LX, noise_mm=0.0)
+    scan = room(0.0)
+    x, y, heading = room.pose(np.array([540 / 1440 * UTM_30LX.true_period_s]))[0]
+    assert heading == pytest.approx(np.pi / 2, abs=0.01)  # looking along +y
+    ahead, right = scan.ranges_mm[540], scan.ranges_mm[540 - 360]
+    assert ahead == pytest.approx(1e3 * (5.0 - y), abs=5)
+    assert right == pytest.approx(1e3 * (7.0 - x), abs=5)
+    assert room(15.0).ranges_mm[540] != ahead
+    assert scan.ranges_mm.min() > 300
+    assert np.array_equal(Room(UTM_30LX, seed=3)(1.0).ranges_mm, Room(UTM_30LX, seed=3)(1.0).ranges_mm)

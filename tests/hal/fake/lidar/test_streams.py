@@ -1,7 +1,5 @@
 """Scans on the wire: ranges, counts, stamps and instants."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 
@@ -11,7 +9,7 @@ import pytest
 from hal.fake.lidar.models import MODELS, UST_10LX, UTM_30LX, LidarModel, Unit
 from hal.fake.lidar.rotor import EvenRotor, TimetableRotor
 from hal.fake.lidar.scan import FakeScan
-from tests.hal.fake.bench import Reply, Talk, virtual
+from tests.hal.fake.bench import Reply, Talk, talking, virtual
 
 PERIOD = UTM_30LX.true_period_s
 STILL = replace(UTM_30LX, latency_s=0.0, jitter_s=0.0)
@@ -26,39 +24,18 @@ def record(command: str, seconds: float, model: LidarModel = UTM_30LX, unit: Uni
     return virtual(scene, model, unit=unit)
 
 
-def test_ranges_arrive_as_the_world_made_them() -> None:
-    acknowledged, *scans = record("MD0000108000000;tag 1", 0.5)
-    assert (acknowledged.echo, acknowledged.status, acknowledged.lines) == ("MD0000108000000;tag 1", "00", [])
-    assert len(scans) == 19
-    for n, scan in enumerate(scans):
-        assert scan.echo == "MD0000108000000;tag 1"
-        assert scan.values() == [1000 + step + 2 * n for step in range(1081)]
-
-
 def test_part_of_the_steps() -> None:
     scan = record("MD0100010200001", 0.2)[1]
     assert scan.values() == [1100, 1101, 1102]
 
 
-def test_countdown_and_end() -> None:
-    async def scene(talk: Talk) -> list[Reply]:
-        talk.say("MD0000108000012;x\n")
-        await asyncio.sleep(1.0)
-        assert not talk.replies()[12 + 1 :]
-        assert (await talk.one("II", 0.1)).pairs["LASR"] == "OFF"
-        return []
-
-    virtual(scene)
-    echoes = [reply.echo for reply in record("MD0000108000012;x", 1.0)]
+@talking()
+async def test_countdown_and_end(talk: Talk) -> None:
+    talk.say("MD0000108000012;x\n")
+    await asyncio.sleep(1.0)
+    echoes = [reply.echo for reply in talk.replies()]
+    assert (await talk.one("II", 0.1)).pairs["LASR"] == "OFF"
     assert echoes == ["MD0000108000012;x"] + [f"MD00001080000{n:02d};x" for n in range(11, -1, -1)]
-
-
-@pytest.mark.parametrize("skip", [0, 1, 9])
-def test_skipped_scans(skip: int) -> None:
-    scans = record(f"MD0000108000{skip}00", 2.0)[1:]
-    ticks = np.diff([scan.tick for scan in scans])
-    assert len(scans) > 5
-    assert np.all(np.abs(ticks - 1e3 * PERIOD * (1 + skip)) < 1.0)
 
 
 def test_cluster_takes_the_nearest_that_is_no_error() -> None:
@@ -104,20 +81,16 @@ def test_modes() -> None:
     assert {reply.status for name, reply in got.items() if name[0] in "GH"} == {"00"}
 
 
-def test_single_measurement_is_the_latest_complete_one_and_waits_for_the_first() -> None:
-    async def scene(talk: Talk) -> tuple[float, list[int], int]:
-        await asyncio.sleep(1.0)
-        await talk.ask("BM", 0.001)
-        first = await talk.one("GD0000000000", 0.5)
-        again = await talk.one("GD0000000000", 0.5)
-        lit = 1000.0 * 1.0
-        assert first.tick >= lit
-        return first.t, [first.values()[0], again.values()[0]], again.tick
-
-    t, values, tick = virtual(scene)
-    assert 1.01 < t < 1.06
-    assert values == [1000, 1002]  # the world is asked only for what is wanted
-    assert 1000.0 * (1.501 - 2 * PERIOD) < tick < 1501.0
+@talking()
+async def test_single_measurement_is_the_latest_complete_one_and_waits_for_the_first(talk: Talk) -> None:
+    await asyncio.sleep(1.0)
+    await talk.ask("BM", 0.001)
+    first = await talk.one("GD0000000000", 0.5)
+    again = await talk.one("GD0000000000", 0.5)
+    assert first.tick >= 1000.0
+    assert 1.01 < first.t < 1.06
+    assert [first.values()[0], again.values()[0]] == [1000, 1002]  # the world is asked only for what is wanted
+    assert 1000.0 * (1.501 - 2 * PERIOD) < again.tick < 1501.0
 
 
 def test_stamp_is_the_clock_at_step_0_and_the_scan_leaves_after_the_last_step() -> None:
@@ -143,19 +116,6 @@ def test_ust_speaks_on_the_ticks_of_its_clock() -> None:
     virtual(scene, UST_10LX, unit=unit)
 
 
-def test_clock_gain() -> None:
-    slow, fast = (record("MD0540054200000", 100.0, STILL, Unit(clock_gain=gain))[-1].tick for gain in (-50e-6, 50e-6))
-    assert fast - slow == pytest.approx(10.0, abs=1.1)
-
-
-def test_stamp_wraps_at_24_bits() -> None:
-    ticks = [scan.tick for scan in record("MD0540054200000", 2.5, unit=Unit(clock_ms=16_776_000))[1:]]
-    (wrap,) = np.flatnonzero(np.diff(ticks) < 0)
-    assert ticks[wrap] >= (1 << 24) - 26
-    assert ticks[wrap + 1] < 26
-    assert np.all(np.abs(np.diff(np.unwrap(ticks, period=1 << 24)) - 1e3 * PERIOD) <= 1.0)
-
-
 def test_two_runs_give_the_same_bytes_and_instants() -> None:
     def run() -> list[tuple[float, bytes]]:
         async def scene(talk: Talk) -> list[tuple[float, bytes]]:
@@ -169,51 +129,31 @@ def test_two_runs_give_the_same_bytes_and_instants() -> None:
     assert run() == run()
 
 
-def test_rs232_is_as_slow_as_its_rate_and_loses_scans_inside() -> None:
-    async def scene(talk: Talk) -> tuple[int, int, list[float]]:
-        talk.say("MD0044072500000\n")
-        await asyncio.sleep(20.0)
-        scans = talk.scans()
-        assert all(scan.values()[0] == 1044 + 2 * (scan.values()[0] - 1044) // 2 for scan in scans)
-        return len(scans), talk.device.counts.lost_in_sensor, [scan.t for scan in scans]
-
-    count, lost, times = virtual(scene, MODELS["URG-04LX"])
-    assert np.diff(times) == pytest.approx(2137 * 10 / 19200)
-    assert count == 17
-    assert lost > 150
+@talking(MODELS["URG-04LX"])
+async def test_quit_lets_at_most_the_scan_on_the_line_pass(talk: Talk) -> None:
+    talk.say("MD0044072500000\n")
+    await asyncio.sleep(5.0)
+    assert [reply.status for reply in await talk.ask("QT", 5.0)] == ["99", "00"]
 
 
-def test_quit_lets_at_most_the_scan_on_the_line_pass() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        talk.say("MD0044072500000\n")
-        await asyncio.sleep(5.0)
-        return [reply.status for reply in await talk.ask("QT", 5.0)]
-
-    assert virtual(scene, MODELS["URG-04LX"]) == ["99", "00"]
-
-
-def test_new_parameters_restart_the_stream() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        talk.say("MD0000108000000\n")
-        await asyncio.sleep(0.2)
-        return [reply.echo for reply in await talk.ask("MS0540054200000", 0.2)]
-
-    echoes = virtual(scene)
+@talking()
+async def test_new_parameters_restart_the_stream(talk: Talk) -> None:
+    talk.say("MD0000108000000\n")
+    await asyncio.sleep(0.2)
+    echoes = [reply.echo for reply in await talk.ask("MS0540054200000", 0.2)]
     at = echoes.index("MS0540054200000")
     assert at <= 1
     assert set(echoes[at:]) == {"MS0540054200000"}
 
 
-def test_queries_are_answered_between_scans() -> None:
-    async def scene(talk: Talk) -> list[str]:
-        talk.say("MD0000108000000\n")
-        for _ in range(20):
-            await asyncio.sleep(0.013)
-            talk.say("II\n")
-        await asyncio.sleep(0.1)
-        return [reply.echo for reply in talk.replies()]
-
-    echoes = virtual(scene)
+@talking()
+async def test_queries_are_answered_between_scans(talk: Talk) -> None:
+    talk.say("MD0000108000000\n")
+    for _ in range(20):
+        await asyncio.sleep(0.013)
+        talk.say("II\n")
+    await asyncio.sleep(0.1)
+    echoes = [reply.echo for reply in talk.replies()]
     assert echoes.count("II") == 20
     assert echoes.count("MD0000108000000") > 10
 
@@ -245,29 +185,22 @@ def test_speed_changes_without_a_jump() -> None:
     assert rotor.start_of(-1) is None
 
 
-def test_source_of_the_wrong_width_is_named() -> None:
+@talking(source=lambda _t: FakeScan(np.zeros(5, dtype=np.int32)))
+async def test_source_of_the_wrong_width_is_named(talk: Talk) -> None:
     problems: list[str] = []
-
-    async def scene(talk: Talk) -> None:
-        talk.loop.set_exception_handler(lambda _loop, context: problems.append(str(context["exception"])))
-        talk.say("MD0000108000000\n")
-        await asyncio.sleep(0.1)
-
-    virtual(scene, source=lambda _t: FakeScan(np.zeros(5, dtype=np.int32)))
+    talk.loop.set_exception_handler(lambda _loop, context: problems.append(str(context["exception"])))
+    talk.say("MD0000108000000\n")
+    await asyncio.sleep(0.1)
     assert "needs (1081,)" in problems[0]
 
 
-def test_source_that_has_nothing_to_say() -> None:
-    async def scene(talk: Talk) -> list[Reply]:
-        return await talk.ask("MD0000108000000", 1.0)
-
-    assert len(virtual(scene, source=lambda _t: None)) == 1
+@talking(source=lambda _t: None)
+async def test_source_that_has_nothing_to_say(talk: Talk) -> None:
+    assert len(await talk.ask("MD0000108000000", 1.0)) == 1
 
 
-def test_a_revolution_that_has_begun_is_not_sent() -> None:
-    async def scene(talk: Talk) -> Reply:
-        await asyncio.sleep(10 * PERIOD + 0.001)
-        await talk.ask("MD0000108000001", 0.2)
-        return talk.scans()[0]
-
-    assert virtual(scene, STILL).tick == int(1e3 * 11 * PERIOD)
+@talking(STILL)
+async def test_a_revolution_that_has_begun_is_not_sent(talk: Talk) -> None:
+    await asyncio.sleep(10 * PERIOD + 0.001)
+    await talk.ask("MD0000108000001", 0.2)
+    assert talk.scans()[0].tick == int(1e3 * 11 * PERIOD)

@@ -1,58 +1,16 @@
 """The virtual bench: its judgement of daemons and drives, and the package in an emulated computer."""
 
-from __future__ import annotations
-
-import json
 import subprocess
 import sys
-import threading
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
-import numpy as np
 import pytest
 
-from tools.bench.report.result import Seen
-from tools.bench.vm import bench, common, image, places, trying_system, world
-from tools.bench.vm.bench import Bench, Ears, Heard
+from tools.bench.vm import bench, common, image, places
 from tools.bench.vm.guests import tried
-from tools.bench.vm.machine import Order
 from tools.bench.vm.scenarios import SCENARIOS
-from tools.bench.world import agreement
-from tools.bench.world.agreement import Trace
-from tools.bench.world.room import room
-from tools.sim.harness import run
-from tools.sim.scene import SimulatedScene
 
 ROOT = Path(__file__).parents[4]
-
-
-def test_what_was_published_inside_is_compared_with_outside() -> None:
-    """The scenario's own arithmetic: a drive in virtual time against itself as the bench would hear it."""
-    seconds = 24.0
-    scene = SimulatedScene(world.scenario(), room())
-    made = run(seconds, scene=scene)
-    outside = agreement.reference_of(SimulatedScene(world.scenario(), room()), seconds)
-    fine = np.arange(made.t_mono[0], made.t_mono[-1], 0.01)
-    inside = agreement.trace_of(made.t_mono, made.pose, fine, scene.truth(fine))
-    assert agreement.differences(inside, outside)[1].max() < 2e-3
-    off = agreement.trace_of(made.t_mono, made.pose + np.array((0.02, 0.0, 0.0)), fine, scene.truth(fine))
-    assert agreement.differences(off, outside)[1].max() > 0.015
-
-    true_late = np.where(made.t_mono < made.t_mono[0] + 10.0, 0.004, 0.012)  # others have begun to use the processor
-
-    def traced(part: slice, by: np.ndarray[Any, Any]) -> agreement.Trace:
-        stamps = made.t_mono[part] + true_late[part] - by
-        return agreement.trace_of(stamps, made.pose[part], fine, scene.truth(fine))
-
-    count, every = len(made.t_mono), slice(None)
-    assert agreement.differences(traced(every, np.zeros(count)), outside)[1].max() > 0.0045, "12 ms at 0.4 m/s"
-    late = agreement.lateness(np.arange(0.0, 0.04, 0.001), traced, count, outside)
-    assert late[-1] == pytest.approx(0.012, abs=0.0011)
-    assert np.median(late[made.t_mono < made.t_mono[0] + 9.0][-10:]) == pytest.approx(0.004, abs=0.0011)
-    assert agreement.differences(traced(every, late), outside)[1].max() < 3.5e-3, "one group has both"
 
 
 @pytest.mark.system
@@ -131,70 +89,3 @@ def test_a_daemon_that_dies_unnoticed_fails_the_scenario(
     assert result.passed is as_wanted
     assert as_wanted or result.said.startswith("the daemon has died unnoticed: process ")
     assert lived.life == after
-
-
-def inside(run: Any = None, waited: float = 0.0) -> Bench:
-    """One that answers commands by ``run``, and has waited for a processor so long whenever it is asked again."""
-    told = iter([10.0, 10.0 + waited])
-    machine = SimpleNamespace(run=run, waited_s=lambda: next(told), broken_off=threading.Event())
-    bench = Bench.__new__(Bench)
-    bench.machine, bench.ears, bench.memory = machine, Ears(), {}  # type: ignore[assignment]  # all that is asked
-    return bench
-
-
-def poses(count: int) -> list[Heard]:
-    return [Heard(0.2 * k + 0.04, 0.2 * k, 3, (0.1 * k, 0.0, 0.0), 0.01) for k in range(count)]
-
-
-def driven(metres: float) -> Bench:
-    """Poses without an error as far as this, and the truth."""
-    bench = inside()
-    bench.memory["drive"] = poses(round(metres / 0.1) + 1)
-    bench.ears.truth.extend((0.05 * k, (0.025 * k, 0.0, 0.0)) for k in range(2000))
-    return bench
-
-
-def test_two_runs_agree_about_a_way_that_both_have_driven(monkeypatch: pytest.MonkeyPatch) -> None:
-    way = np.arange(0.0, 20.0, 0.05)
-    monkeypatch.setattr(trying_system, "outside", lambda: Trace(way, np.zeros((len(way), 2))))
-    seen = trying_system.agrees_with_outside(driven(5.0))
-    assert isinstance(seen, Seen)
-    assert [round(one.value) for one in seen.figures] == [0.0, 5.0, 0.0, 0.0, 0.0]
-    short = driven(0.6)
-    short.memory["drive"][-1] = replace(short.memory["drive"][-1], missed=3, overruns=2, fault=301)
-    with pytest.raises(Order, match=r"way compared: 0\.\d+ m.*; meanwhile 3 scans missed, 2 cycles .* \[301\]"):
-        trying_system.agrees_with_outside(short)
-    for name, least, late in (
-        ("LATE_S", 0.011, np.full(51, 0.012)), ("SPREAD_MS", 11, np.linspace(0.0, 0.012, 51)),
-        ("EARLY_S", 0.011, np.full(51, -0.012)),
-    ):  # fmt: skip
-        monkeypatch.setattr(agreement, "lateness", lambda *_, late=late: late)
-        trying_system.agrees_with_outside(driven(5.0))
-        with monkeypatch.context() as less:
-            less.setattr(trying_system, name, least)
-            with pytest.raises(Order, match=r"late by: -?12"):
-                trying_system.agrees_with_outside(driven(5.0))
-
-
-@pytest.mark.parametrize(("degraded", "off", "right"), [(4, 0.0, True), (8, 0.0, False), (0, 0.2, False)])
-def test_a_drive_is_tracking_and_right_and_is_shown_where_it_is_not(
-    degraded: int, off: float, right: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    bench = driven(5.0)
-    bench.folder = tmp_path
-    heard = [replace(one, pose=(0.1 * k, off, 0.0), state=3 if k >= degraded else 4) for k, one in enumerate(poses(51))]
-    bench.start = (0.0, 0.0, 0.0)
-    for name, made in (
-        ("drive", lambda: None), ("until", lambda *_: 0.0), ("collect", lambda seconds: heard),
-        ("placed", lambda *_: 0.0),
-    ):  # fmt: skip
-        monkeypatch.setattr(bench, name, made)
-    if right:
-        assert isinstance(trying_system.drives(bench), Seen)
-        kept = json.loads((tmp_path / "drive").read_text())
-        assert kept["poses"][3][1:3] == [pytest.approx(0.6), [pytest.approx(0.3), 0.0, 0.0]]
-        assert kept["truth"][12] == [pytest.approx(0.6), [pytest.approx(0.3), 0.0, 0.0]]
-        return
-    with pytest.raises(common.Unmet, match=r"TRACKING for 84 % of 51 poses|0\.200 m from the truth") as unmet:
-        trying_system.drives(bench)
-    assert [plot.title for plot in unmet.value.seen.plots] == ["trajectory", "age of a pose that comes"]

@@ -1,7 +1,5 @@
 """Light through a DAC: lamps are decoded behind its low pass, in order."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Generator
 

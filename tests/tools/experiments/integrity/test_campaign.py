@@ -1,7 +1,5 @@
 """The integrity campaign: its judgement, product scenarios, and a short drive."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fig. 5: errors against a known offset; the laser alone over the first metres."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

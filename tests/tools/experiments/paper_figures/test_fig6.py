@@ -1,7 +1,5 @@
 """Fig. 6: truth comes from the simulator; precision and recall; a short drive closes right loops only."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

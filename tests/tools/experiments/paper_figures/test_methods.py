@@ -1,7 +1,5 @@
 """The methods beside each other: which number stands for a row, and a small part of the whole."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The experiment on static grids: halves stay separate, and real places reach the stated numbers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

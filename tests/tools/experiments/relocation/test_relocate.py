@@ -1,7 +1,5 @@
 """Relocation: the judge of an outcome, and a few robots in the lit house."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

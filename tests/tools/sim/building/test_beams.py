@@ -1,7 +1,5 @@
 """Errors of the simulated lidar: noise, incidence and edges; repeatability."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

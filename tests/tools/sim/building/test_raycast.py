@@ -1,7 +1,5 @@
 """The cast scan against a slow twin and cases worked out by hand; tours keep clear of surfaces."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

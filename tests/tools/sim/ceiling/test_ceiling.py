@@ -1,7 +1,5 @@
 """The ceiling against closed forms: Lambertian sources, shadows, one bounce, and the state of lamps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The estimator's model does not explain the simulated strengths: an experiment that passes has not met itself."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

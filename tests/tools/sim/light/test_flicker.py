@@ -1,7 +1,5 @@
 """The air interface is not seen: every line of every code stays below the no-effect level of IEEE 1789."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

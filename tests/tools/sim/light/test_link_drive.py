@@ -1,7 +1,5 @@
 """Link-level drives: records in order, and errors of the stated size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

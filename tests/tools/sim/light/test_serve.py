@@ -1,8 +1,5 @@
 """The lights of a simulated building, read by another process over a socket."""
 
-from __future__ import annotations
-
-import asyncio
 from contextlib import AsyncExitStack
 from pathlib import Path
 
@@ -19,20 +16,17 @@ def lit(**lights: object) -> SimulatedScene:
     return SimulatedScene(Scenario("corridor_loop", people=False, lights=Lights(**lights)))  # type: ignore[arg-type]
 
 
-def test_a_block_is_read_over_the_socket(tmp_path: Path) -> None:
-    async def block() -> np.ndarray:
-        scene = lit()
-        assert scene.light is not None
-        async with AsyncExitStack() as stack:
-            _, where = await serve_light(scene.light, f"unix:{tmp_path}/i2c", stack)
-            bus = await open_bus(where)
-            try:
-                done = await bus.transfer((read(0x4D, 2222),))
-            finally:
-                await bus.close()
-        return np.frombuffer(done.reads[0], dtype=">u2").astype(float)
-
-    words = asyncio.run(block())
+async def test_a_block_is_read_over_the_socket(tmp_path: Path) -> None:
+    scene = lit()
+    assert scene.light is not None
+    async with AsyncExitStack() as stack:
+        _, where = await serve_light(scene.light, f"unix:{tmp_path}/i2c", stack)
+        bus = await open_bus(where)
+        try:
+            done = await bus.transfer((read(0x4D, 2222),))
+        finally:
+            await bus.close()
+    words = np.frombuffer(done.reads[0], dtype=">u2").astype(float)
     assert len(words) == 1111
     assert words.max() < 4096
     swing = np.abs(np.fft.rfft(words - words.mean()))

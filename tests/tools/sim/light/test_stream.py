@@ -1,7 +1,5 @@
 """The waveform of a whole ceiling against the plain numerical one; the decoder's errors against the link level's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

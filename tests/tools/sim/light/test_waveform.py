@@ -1,7 +1,5 @@
 """The light simulator against brute force and theory: code edges, filter and converter noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

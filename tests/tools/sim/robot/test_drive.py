@@ -1,7 +1,5 @@
 """The drive keeps its limits; errors of the wheels have the stated size."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A robot that is lifted and put down elsewhere: the truth jumps, its wheels do not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,6 +1,4 @@
-"""Lamps that rise slowly: flagged, their amplitudes corrected, and the variances honest."""
-
-from __future__ import annotations
+"""Lamps with slow edges, and two lamps of one code."""
 
 from dataclasses import replace
 
@@ -84,3 +82,69 @@ def test_a_lamp_in_the_place_of_a_slow_one_is_not_slow() -> None:
         assert not (epoch.flags[epoch.ids == new.code] & LinkFlag.SLOW).any()
     block, epoch = run.block()
     assert abs(run.errors(block, epoch)[-1]) < 0.01
+
+
+RATIOS = (1.0, 0.3, 0.1)
+
+
+def twins(seed: int, apart: float, ratio: float, ppm: float = 0.5) -> Run:
+    world = ceiling(seed, np.array([2.3e-6, 1e-6, 1e-6]))
+    first = world.lamps[0]
+    world.lamps.append(
+        replace(
+            first, current_a=ratio * first.current_a, phase_chips=first.phase_chips + apart, ppm=first.ppm + ppm,
+            lamp_id=7,
+        )
+    )  # fmt: skip
+    return Run(world)
+
+
+def look(run: Run, count: int, settle: int = 10) -> None:
+    """No code but those of lamps from the first block on; after some blocks both lamps, flagged and right."""
+    code = run.codes()[0]
+    for k, (block, epoch) in enumerate(run.blocks(count)):
+        ids = np.array(epoch.ids)
+        assert set(ids.tolist()) <= set(run.codes())
+        if k >= settle:
+            both = ids == code
+            assert np.count_nonzero(both) == 2
+            assert (np.array(epoch.flags)[both] & LinkFlag.TWIN).all()
+            right = sorted(block.truth_a[[0, 3]])
+            np.testing.assert_allclose(sorted(epoch.amplitude[both]), right, rtol=0.03, atol=1e-9)
+
+
+@pytest.mark.parametrize("ratio", RATIOS)
+@pytest.mark.parametrize("apart", [0.3, 0.5, 0.8, 1.0, 1.2, 1.5, -0.3, -0.9])
+def test_twins_are_separated(apart: float, ratio: float) -> None:
+    look(twins(11, apart, ratio), 40)
+
+
+@pytest.mark.parametrize(("seed", "apart", "ratio"), [(1, 1.5, 0.3), (6, 1.2, 0.3), (7, 1.5, 1.0)])
+def test_candidates_do_not_shift_twins_by_their_distance(seed: int, apart: float, ratio: float) -> None:
+    """Beside twins that are just found, most candidates are their cross-correlations."""
+    look(twins(seed, apart, ratio), 15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", RATIOS)
+@pytest.mark.parametrize("apart", np.round(np.linspace(0.3, 1.5, 12), 2).tolist())
+def test_no_false_code_in_two_thousand_blocks(apart: float, ratio: float) -> None:
+    run = twins(12, apart, ratio, ppm=0.001)
+    for _, epoch in run.blocks(2000):
+        assert set(epoch.ids.tolist()) <= set(run.codes())
+
+
+def test_twins_drift_through_each_other() -> None:
+    """Where they cannot be separated they are one lamp, and no third code appears."""
+    run = twins(13, -0.6, 0.5, ppm=50.0)
+    for _, epoch in run.blocks(120):
+        assert set(epoch.ids.tolist()) <= set(run.codes())
+    code = run.codes()[0]
+    assert epoch.ids.tolist().count(code) == 2
+
+
+def test_a_single_lamp_has_no_twin() -> None:
+    run = Run(ceiling(14))
+    for _, epoch in run.blocks(100):
+        assert len(set(epoch.ids.tolist())) == len(epoch.ids)
+        assert not (epoch.flags & LinkFlag.TWIN).any()

@@ -1,7 +1,6 @@
-"""The criterion of growth, and a simulated day."""
+"""Programs of the tools: modules can be imported, clients say how they are used, a soak sees growth."""
 
-from __future__ import annotations
-
+import importlib
 import json
 import subprocess
 import sys
@@ -12,7 +11,36 @@ import pytest
 
 from tools.soak.watched import Watch, growth, stored
 
+CLIENTS = Path(__file__).parents[2] / "tools/clients"
+
+
+@pytest.mark.parametrize("name", ["read_modbus", "read_lights", "subscribe_pose", "send_odometry", "send_command"])
+@pytest.mark.parametrize("words", [["--help"], ["127.0.0.1", "no-port"]])
+def test_a_client_that_is_misused_says_how_it_is_used(name: str, words: list[str]) -> None:
+    told = subprocess.run(
+        [sys.executable, str(CLIENTS / f"{name}.py"), *words], capture_output=True, text=True, timeout=20
+    )
+    assert told.returncode == 1
+    assert f"python {name}.py" in told.stderr
+    assert "Traceback" not in told.stderr
+
+
+def test_a_port_at_which_nobody_listens_by_tcp_is_said() -> None:
+    command = [sys.executable, str(CLIENTS / "read_modbus.py"), "127.0.0.1", "1", "tcp"]
+    told = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    assert told.returncode == 1
+    assert "is lumiloop running" in told.stderr
+    assert "Traceback" not in told.stderr
+
+
 ROOT = Path(__file__).parents[2]
+MODULES = sorted(path for path in (ROOT / "tools").rglob("*.py") if path.name != "__main__.py")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_a_module_can_be_imported(path: Path) -> None:
+    """A module that cannot be imported fails; nothing else is asserted."""
+    importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"))
 
 
 def watch(slope_mb_h: float, files: int = 10, grows: float = 0.0) -> Watch:
