@@ -17,6 +17,7 @@ from estimator.mapping.loop_verification import Found
 from estimator.mapping.map_parts import MapParts
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
+from estimator.numerics.symmetric3 import invert3
 from estimator.result import Loop
 
 FLOOR: Final = np.diag((0.005**2, 0.005**2, math.radians(0.1) ** 2))
@@ -27,6 +28,9 @@ NEAR_M, NEAR_RAD, KEPT = 1.5, 0.25 * math.pi, 2
 
 A grid of positions would fill up for hours instead, because each lap begins its submaps at other positions.
 """
+
+UNSOLVED: Final = 16.3
+"""Squared Mahalanobis distance (99.9 % of chi-square, 3 degrees) of the map from an edge that no solution included."""
 
 OWN: Final = 12
 """Submaps of this session kept on top of a restored map that is only used."""
@@ -249,7 +253,10 @@ class SubmapGraph:
         return self.parts.fixed and submap.first < self.parts.session_start
 
     def drop(self, submap: Submap) -> None:
-        """Remove a submap from the graph; its keyframes refer to the neighbour of smallest relative covariance."""
+        """Remove a submap from the graph; its keyframes refer to the neighbour of smallest relative covariance.
+
+        Its pose there is that of the map, or that of the edge where the map has not been solved with the edge yet.
+        """
         rows = handed_on(np.array(list(self.submaps)), self.constraints, submap.key)
         joined = [self.constraints.seen_from(submap.key, row) for row in rows]
         if not joined:
@@ -257,7 +264,10 @@ class SubmapGraph:
         key, T, P = min(joined, key=lambda one: float(np.trace(one[2])))
         hub, A = self.submaps[key], se2.adjoint(T)
         self.constraints.reroute(submap.key, key, se2.inverse(T), A @ P @ A.T, rows)
-        submap.hang_on(hub, se2.between(hub.T_map_submap, submap.T_map_submap))
+        in_map = se2.between(hub.T_map_submap, submap.T_map_submap)
+        off = se2.between(T, se2.inverse(in_map))
+        solved = float(off @ invert3(P) @ off) <= UNSOLVED
+        submap.hang_on(hub, in_map if solved else se2.inverse(T))
         submap.settled = None
         del self.submaps[submap.key]
 

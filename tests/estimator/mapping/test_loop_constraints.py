@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from estimator.job_queue import JobQueue
 from estimator.mapping.constraints import Constraints
+from estimator.mapping.keyframe import Submap
 from estimator.mapping.pose_graph import UPPER, Graph, optimise
+from estimator.mapping.submap_graph import SubmapGraph
 from estimator.measurements import Array
 from estimator.numerics import se2
 from tests.estimator.circuit import SMALL
@@ -87,3 +90,16 @@ def test_the_covariance_of_a_pose_is_its_block_of_the_inverse() -> None:
         H += J.T @ W @ J
     np.testing.assert_allclose(solution.covariance, np.linalg.inv(H[3:, 3:])[-3:, -3:], rtol=1e-5, atol=1e-12)
     assert not optimise(graph, covariance_of=0).covariance.any()  # held
+
+
+@pytest.mark.parametrize("drift_m", [0.0, 2.0])
+def test_a_submap_taken_out_before_its_loop_is_solved_moves_by_the_loop(drift_m: float) -> None:
+    graph, P = SubmapGraph(JobQueue()), np.diag((0.01**2, 0.01**2, 0.005**2))
+    at = np.array(((0.0, 0.0, 0.0), (5.0, 0.0, 1.0), (1.0 + drift_m, 0.0, 2.0)))
+    graph.submaps = {key: Submap(key, key, T.copy(), T.copy()) for key, T in enumerate(at, 1)}
+    for a, b in ((1, 2), (2, 3)):
+        graph.constraints.add(a, b, se2.between(at[a - 1], at[b - 1]), 9.0 * P, False)
+    loop, gone = np.array((1.0, 0.0, 2.0)), graph.submaps[1]
+    graph.constraints.add(1, 3, loop, P, True)
+    graph.drop(gone)
+    np.testing.assert_allclose(se2.between(gone.place(), graph.submaps[3].place()), loop, atol=1e-9)
