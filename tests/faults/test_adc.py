@@ -79,7 +79,7 @@ WRONG = [
     for chip, noun, says, start, where in (
         ("ADS1115", DeviceRefused, "is not an MCP3221: it has registers", False, {}),
         ("ADS1115", DeviceRefused, "is not an MCP3221: it has registers", True, {}),
-        ("LM75", DataInvalid, "data words with bits that it keeps at zero.*another kind", False, {}),
+        ("LM75", DataInvalid, "data words with bits that it keeps at zero.*check converter type", False, {}),
         ("24C02", DeviceRefused, "bit 1 at zero", True, ADC121),
         ("MCP3221", DeviceRefused, "has no registers", True, ADC121),
         ("LM75", DeviceRefused, "is not an ADC121C021", True, ADC121),
