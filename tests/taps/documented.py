@@ -29,7 +29,7 @@ RUN: Final = {
         r"map-files.md: lumiloop map", r"replay.md: lumiloop replay intel",
     ),
     "alone": (
-        r"air-interface.md: lumiloop codes", r"simulator.md: python -m tools.sim.report",
+        r"air-interface.md: lumiloop codes", r"simulator.md: python -m tools.sim.(report|building.draw|light.draw)",
         r"bench.md: python -m tools.bench.world --list",
     ),
 }  # fmt: skip
