@@ -14,7 +14,7 @@ from estimator.measurements import Job
 from estimator.numerics.arrays import Array
 
 SURPRISE: Final = 16.3
-"""Squared Mahalanobis distance (3 degrees of freedom, 99.9 %) above which the pose and the light solution disagree."""
+"""Squared Mahalanobis distance (99.9 % of chi-square, 3 degrees of freedom) above which two poses disagree."""
 
 
 VAGUE: Final = np.diag((4.0, 4.0, 33.0))

@@ -18,7 +18,7 @@ from estimator.mapping.map_parts import MapParts
 from estimator.numerics import se2
 from estimator.numerics.arrays import Array
 from estimator.numerics.symmetric3 import invert3
-from estimator.result import Loop
+from estimator.result import SURPRISE, Loop
 
 FLOOR: Final = np.diag((0.005**2, 0.005**2, math.radians(0.1) ** 2))
 """Covariance that a keyframe's pose relative to the previous one has beyond that of the matches: 5 mm and 0.1 deg."""
@@ -28,9 +28,6 @@ NEAR_M, NEAR_RAD, KEPT = 1.5, 0.25 * math.pi, 2
 
 A grid of positions would fill up for hours instead, because each lap begins its submaps at other positions.
 """
-
-UNSOLVED: Final = 16.3
-"""Squared Mahalanobis distance (99.9 % of chi-square, 3 degrees) of the map from an edge that no solution included."""
 
 OWN: Final = 12
 """Submaps of this session kept on top of a restored map that is only used."""
@@ -266,7 +263,7 @@ class SubmapGraph:
         self.constraints.reroute(submap.key, key, se2.inverse(T), A @ P @ A.T, rows)
         in_map = se2.between(hub.T_map_submap, submap.T_map_submap)
         off = se2.between(T, se2.inverse(in_map))
-        solved = float(off @ invert3(P) @ off) <= UNSOLVED
+        solved = float(off @ invert3(P) @ off) <= SURPRISE
         submap.hang_on(hub, in_map if solved else se2.inverse(T))
         submap.settled = None
         del self.submaps[submap.key]

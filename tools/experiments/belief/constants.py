@@ -65,16 +65,16 @@ def number(value: ast.expr) -> bool:
 
 
 def meaning(body: list[ast.stmt], at: int, name: str) -> str:
-    """What the class says of an attribute, or the docstring after the assignment, or after the group it stands in."""
+    """Text of the class on an attribute, or the docstring after the assignment, or after the group it stands in."""
     documented = [
         node.value.value for node in body if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
     ]
     for text in map(str, documented[:1] if name.islower() else []):
-        told = re.search(
+        found = re.search(
             rf"(?:^|\n|[.;] )\s*(?:\w+, )*{name}(?:, \w+)*: (.*?)(?:(?:[.;]|\n) *\w+(?:, \w+)*: |\Z)", text, re.S
         )
-        if told:
-            return " ".join(told[1].split())
+        if found:
+            return " ".join(found[1].split())
     for node in body[at + 1 :]:
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             return " ".join(str(node.value.value).split())

@@ -30,7 +30,7 @@ SINCE, UNTIL = 25.0, 50.0
 Arrival = tuple[float, Any]
 Change = Callable[[list[Arrival], Scenario], list[Arrival]]
 Lidar = Callable[[RawScan, list[RawScan]], RawScan]
-"""What a lidar says instead of a scan; it gets all scans so far, that one the last."""
+"""Returns the scan that replaces the given one; the second argument has all scans so far, that one the last."""
 
 LIDAR: Final = tuple(fault for fault in Fault if 101 <= fault <= 110)
 SURVEY: Final = tuple(fault for fault in Fault if 171 <= fault <= 175)
@@ -57,10 +57,10 @@ class Lie:
 
 
 def _lidar(change: Lidar, late_s: float = 0.0) -> Lie:
-    def changed(told: list[Arrival], scene: Scenario) -> list[Arrival]:
+    def changed(stream: list[Arrival], scene: Scenario) -> list[Arrival]:
         so_far: list[RawScan] = []
         out: list[Arrival] = []
-        for t, thing in told:
+        for t, thing in stream:
             if isinstance(thing, RawScan):
                 so_far.append(thing)
                 if SINCE <= thing.t_mono < UNTIL:
@@ -118,10 +118,10 @@ def _permuted(lamps: tuple[Lamp, ...], seed: int) -> Sequence[Lamp]:
 def _odometry(change: Callable[[float, float, float], Sequence[float]]) -> Lie:
     """Odometry that measures other steps (ahead, left, turn) than the wheels make."""
 
-    def changed(told: list[Arrival], scene: Scenario) -> list[Arrival]:
+    def changed(stream: list[Arrival], scene: Scenario) -> list[Arrival]:
         before = pose = se2.identity()
         out: list[Arrival] = []
-        for t, thing in told:
+        for t, thing in stream:
             if isinstance(thing, RawOdometry):
                 now = np.array((thing.x, thing.y, thing.yaw))
                 step = se2.between(before, now)
@@ -138,11 +138,11 @@ def _odometry(change: Callable[[float, float, float], Sequence[float]]) -> Lie:
 def _gyro(change: Callable[[float], float]) -> Lie:
     """A gyro of 50 Hz beside the wheels, right until it lies."""
 
-    def changed(told: list[Arrival], scene: Scenario) -> list[Arrival]:
+    def changed(stream: list[Arrival], scene: Scenario) -> list[Arrival]:
         t = np.arange(1.0, scene.seconds - 1.0, 0.02)
         rate = np.gradient(np.unwrap(scene.pose(t)[:, 2]), t).tolist()
         turns = ((at, change(one) if SINCE <= at < UNTIL else one) for at, one in zip(t.tolist(), rate, strict=True))
-        return sorted([*told, *((at + 0.004, RawImu(at + 0.004, at, turn)) for at, turn in turns)], key=itemgetter(0))
+        return sorted([*stream, *((at + 0.004, RawImu(at + 0.004, at, turn)) for at, turn in turns)], key=itemgetter(0))
 
     return Lie(GYRO, changed)
 
@@ -193,8 +193,8 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """What came of it.
+class Outcome:
+    """Outcome of a case.
 
     Attributes:
         rows: (cycles, columns) of :data:`integrity.run.COLUMNS`, from where the lie begins. found: their verdict.
@@ -210,7 +210,7 @@ class Told:
 
 
 @quiet()
-def told(case: Case) -> Told | None:
+def outcome(case: Case) -> Outcome | None:
     """Run one case; None where nothing can drive in the room that was drawn."""
     lie = LIES.get(case.lie, Lie(()))
     try:
@@ -229,7 +229,7 @@ def told(case: Case) -> Told | None:
     named = min((t for fault, t in first.items() if fault in lie.culprits), default=math.inf)
     others = {t: fault for fault, t in first.items() if t < named and fault != Fault.PROTECTION_ALERT}
     found = judged(f"{case.lie or case.kind}-{case.seed}", rows, np.zeros((0, 2)), (case.lit, False, ""))
-    return Told(case, rows, found, named - begun, others[min(others)] if others else 0)
+    return Outcome(case, rows, found, named - begun, others[min(others)] if others else 0)
 
 
 def followed(scene: Scenario, change: Change | None) -> tuple[Watcher, Array]:

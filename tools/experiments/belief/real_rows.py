@@ -22,7 +22,7 @@ BASES: Final = ("exp1", "exp2", "wean2")
 """Logs that are spoiled: two of a lidar of four metres, one of a SICK; their wheels are right."""
 ONCE: Final = frozenset({"whole seconds", "zero stamps", "way +20 %", "turn +20 %", *spoil.MOUNTS, *spoil.OFFSETS})
 """Kinds in which nothing is drawn by chance."""
-END_M, SAID_M, LEARNED_M = 0.3, 5.0, 20.0
+END_M, NAMED_M, LEARNED_M = 0.3, 5.0, 20.0
 """Limits: distance of the end from the clean run; way until wrong wheels are named, until a mount is known."""
 NAMES_WHEELS: Final = (Fault.ODOMETRY_JUMPS, Fault.ODOMETRY_DISAGREES, Fault.ODOMETRY_SCALE)
 
@@ -174,10 +174,10 @@ def wheels(work: Work) -> Report:
     found = drives(work, spoil.WHEELS)
     table = []
     for kind, some in found.items():
-        said = max((one.wheels for one in some if not one.right), default=0.0)
-        bad = sum(not one.right and one.wheels > SAID_M for one in some)
+        named = max((one.wheels for one in some if not one.right), default=0.0)
+        bad = sum(not one.right and one.wheels > NAMED_M for one in some)
         worst = max(one.worst for one in some), max(one.turned for one in some)
-        table.append((kind, len(some), *worst, said if math.isfinite(said) else "never", bad))
+        table.append((kind, len(some), *worst, named if math.isfinite(named) else "never", bad))
     count, beyond, cycles = (total(found, value) for value in (lambda _: 1, lambda o: o.beyond, lambda o: o.bounded))
     figures = (
         figure("wheels", f"wheels wrong, neither right to 0.3 m / 3 deg nor named within 5 m, of {count}",

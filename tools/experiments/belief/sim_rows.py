@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from tools.experiments import __main__ as program
-from tools.experiments.belief.lies import GYRO, LIES, Case, Told, told
+from tools.experiments.belief.lies import GYRO, LIES, Case, Outcome, outcome
 from tools.experiments.belief.real_rows import figure
 from tools.experiments.belief.replays import kept
 from tools.experiments.integrity.run import COLUMNS
@@ -25,8 +25,8 @@ OTHERS: Final = ("fusion", "second-world")
 """Experiments whose tables belong to the row of solutions."""
 
 
-def _told(work: Work, cases: list[Case]) -> dict[Case, Told]:
-    made = zip(cases, work.map(told, cases, "drives in the simulator", kept()), strict=True)
+def _outcomes(work: Work, cases: list[Case]) -> dict[Case, Outcome]:
+    made = zip(cases, work.map(outcome, cases, "drives in the simulator", kept()), strict=True)
     return {case: one for case, one in made if one is not None}
 
 
@@ -38,7 +38,7 @@ def lies(work: Work) -> Report:
         for name, lie in LIES.items()
         for lit in lie.lit
     }
-    every = _told(work, [case for cases in groups.values() for case in cases])
+    every = _outcomes(work, [case for cases in groups.values() for case in cases])
     table = [(name, *_summed(some)) for name, of in groups.items() if (some := [every[c] for c in of if c in every])]
     third = [one for one in every.values() if one.case.lit or LIES[one.case.lie].culprits == GYRO]
     beyond, cycles = (sum(getattr(one.found, name) for one in every.values()) for name in ("beyond_bound", "bounded"))
@@ -57,7 +57,7 @@ def lies(work: Work) -> Report:
     return Report(figures, (Table("Sensors that lie", head, tuple(table)),), seeds=tuple(seeds), notes=(note,))
 
 
-def _summed(some: list[Told]) -> tuple[int, float, int, float, float, float | str, str, int, int]:
+def _summed(some: list[Outcome]) -> tuple[int, float, int, float, float, float | str, str, int, int]:
     found, named = [one.found for one in some], max(one.named for one in some)
     return (
         len(some), max(one.wrong_s for one in found), sum(one.wrong for one in found),
@@ -75,7 +75,7 @@ def solutions(work: Work) -> Report:
     cases = [Case("", kind, k) for kind in CLASSES for k in seeds] + [
         Case("", kind, k, "light") for kind in lit for k in seeds
     ]
-    every = _told(work, cases)
+    every = _outcomes(work, cases)
 
     def of(kind: str, use: str) -> list[Array]:
         return [one.rows for case, one in every.items() if (case.kind, case.use) == (kind, use) and len(one.rows)]
